@@ -1,0 +1,204 @@
+"""Names and configurations that every room of the house shares. Imports neither torch nor mujoco.
+
+All configurations are frozen, checked when they are made, and survive a trip through JSON
+(`to_json` / `from_json`), so that a round can store exactly what it ran with.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Self
+
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+
+
+class TaskName(StrEnum):
+    """Robot tasks that can be rolled out, labelled and fine-tuned."""
+
+    AVOID = "avoid"
+
+
+class FinetuneMethod(StrEnum):
+    """Fine-tuners that turn labels into a candidate policy."""
+
+    RODIF_GUIDED = "rodif_guided"  # our default: RoDiF scores the trajectories, guidance moves the policy
+    RODIF = "rodif"  # the paper's robust loss (Eq. final_robust_loss)
+    DP_DPO = "dp_dpo"  # the paper's baseline (Eq. dense_loss)
+
+
+class Reduction(StrEnum):
+    """How the outer logistic of the RoDiF loss sees the votes (the paper writes `sum`)."""
+
+    SUM = "sum"
+    MEAN = "mean"
+    GROUP = "group"  # one outer logistic per group of `group_size` consecutive pairs
+
+
+class StepPairing(StrEnum):
+    """Which decision steps of winner and loser are compared."""
+
+    SAME_INDEX = "same_index"  # the paper: step t with step t, over min(T_w, T_l) steps
+    MATCHED_STATE = "matched_state"  # the same, weighted by how far the two states still match
+
+
+class FirstStep(StrEnum):
+    """What happens to denoising step k = 1, whose posterior standard deviation is zero."""
+
+    DROP = "drop"  # deterministic when sampling, absent from the log-probability
+    FLOOR = "floor"  # the schedule's `std_floor` in sampling and in scoring
+
+
+class Scorer(StrEnum):
+    """What turns noisy labels into one utility per trajectory in `rodif_guided`."""
+
+    NETWORK = "network"  # a few RoDiF updates on a throw-away copy; mean log-ratio of the trajectory
+    GAUSSIAN_PROCESS = "gaussian_process"  # Bradley-Terry with a Gaussian-process prior on the path
+    COMBINED = "combined"  # mean of both, each standardised
+
+
+def parse_name[NameT: StrEnum](names: type[NameT], value: str, kind: str) -> NameT:
+    """Turn text into a member of `names`; raises UnknownNameError listing the legal ones."""
+    try:
+        return names(value)
+    except ValueError:
+        raise UnknownNameError(kind, value, [member.value for member in names]) from None
+
+
+def _require(holds: bool, name: str, value: object, legal: str) -> None:
+    if not holds:
+        raise ValueOutOfRangeError(name, value, legal)
+
+
+class _JsonConfig:
+    """Mapping to and from plain JSON types for the frozen configurations below."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain dict of JSON types; `from_json` gives back an equal object."""
+        assert dataclasses.is_dataclass(self)
+        return {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in dataclasses.asdict(self).items()
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Build and check; raises UnknownNameError for a field that does not exist."""
+        assert dataclasses.is_dataclass(cls)
+        names = [item.name for item in dataclasses.fields(cls)]
+        for key in data:
+            if key not in names:
+                raise UnknownNameError(f"{cls.__name__} field", key, names)
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+@dataclass(frozen=True)
+class GuideConfig(_JsonConfig):
+    """Second half of `rodif_guided`: how the kept trajectories move the policy."""
+
+    scorer: Scorer = Scorer.COMBINED
+    score_updates: int = 12  # full-batch RoDiF updates of the throw-away copy
+    scales: tuple[float, ...] = (1.0, 2.0, 3.0)  # guidance scales tried, the gate picks one
+    updates: int = 200
+    learning_rate: float = 1e-4
+    batch_size: int = 256
+    ema_decay: float = 0.98
+    selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
+    self_training_rounds: int = 0  # extra guide passes on fresh rollouts, without new labels
+    self_training_rollouts: int = 150
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scorer", parse_name(Scorer, self.scorer, "scorer"))
+        object.__setattr__(self, "scales", tuple(float(s) for s in self.scales))
+        _require(self.score_updates >= 1, "score_updates", self.score_updates, "at least 1")
+        _require(
+            len(self.scales) > 0 and all(0 < s <= 10 for s in self.scales),
+            "scales",
+            self.scales,
+            "one or more numbers in (0, 10]",
+        )
+        _require(self.updates >= 1, "updates", self.updates, "at least 1")
+        _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "in (0, 1]")
+        _require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
+        _require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
+        _require(
+            self.selection_rollouts >= 10, "selection_rollouts", self.selection_rollouts, "at least 10"
+        )
+        _require(
+            0 <= self.self_training_rounds <= 5,
+            "self_training_rounds",
+            self.self_training_rounds,
+            "0 … 5",
+        )
+        _require(
+            self.self_training_rollouts >= 10,
+            "self_training_rollouts",
+            self.self_training_rollouts,
+            "at least 10",
+        )
+
+
+@dataclass(frozen=True)
+class FinetuneConfig(_JsonConfig):
+    """Everything a fine-tuning round can be told; stored with the round.
+
+    Defaults are the paper's Avoid column (Table hyperparameters) where it gives a value.
+    """
+
+    method: FinetuneMethod = FinetuneMethod.RODIF_GUIDED
+    conservativeness: float | None = None  # γ in [0, 1); None: estimated from the labels
+    vote_temperature: float = 1.0  # α of the inner sigmoid
+    outer_temperature: float = 1.0  # α of the outer sigmoid
+    kl_coef: float = 0.1  # β
+    vote_scale: float = 1.0  # ν ≈ 1
+    reduction: Reduction = Reduction.SUM
+    group_size: int = 64  # pairs per outer logistic when reduction = group
+    step_pairing: StepPairing = StepPairing.SAME_INDEX
+    matched_state_scale: float = 0.15  # length scale of `matched_state`, normalised observation units
+    executed_only: bool = False  # log-ratio over the executed part of the chunk only
+    learning_rate: float = 3e-5
+    updates: int = 30  # full-batch updates of `rodif` and `dp_dpo`
+    chunk_rows: int = 1024  # network rows per forward pass; memory only, not the result
+    seed: int = 0
+    guide: GuideConfig = field(default_factory=GuideConfig)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "method", parse_name(FinetuneMethod, self.method, "method"))
+        object.__setattr__(self, "reduction", parse_name(Reduction, self.reduction, "reduction"))
+        object.__setattr__(
+            self, "step_pairing", parse_name(StepPairing, self.step_pairing, "step_pairing")
+        )
+        if isinstance(self.guide, Mapping):
+            object.__setattr__(self, "guide", GuideConfig.from_json(self.guide))
+        gamma = self.conservativeness
+        _require(
+            gamma is None or (math.isfinite(gamma) and 0 <= gamma < 1),
+            "conservativeness",
+            gamma,
+            "in [0, 1), or null to estimate it from the labels",
+        )
+        for name in ("vote_temperature", "outer_temperature", "kl_coef", "vote_scale"):
+            value = getattr(self, name)
+            _require(math.isfinite(value) and value > 0, name, value, "a finite number above 0")
+        _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "in (0, 1]")
+        _require(self.matched_state_scale > 0, "matched_state_scale", self.matched_state_scale, "> 0")
+        for name in ("updates", "chunk_rows", "group_size"):
+            _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        _require(0 <= self.seed < 2**63, "seed", self.seed, "in [0, 2^63)")
+
+
+@dataclass(frozen=True)
+class RolloutConfig(_JsonConfig):
+    """A batch of rollouts: episode i uses seed `seed + i` for its start and its policy noise."""
+
+    episodes: int = 100
+    seed: int = 0
+    max_parallel: int = 128  # simulations stepped together; memory only, not the result
+
+    def __post_init__(self) -> None:
+        _require(1 <= self.episodes <= 100_000, "episodes", self.episodes, "1 … 100000")
+        _require(0 <= self.seed < 2**62, "seed", self.seed, "in [0, 2^62)")
+        _require(self.max_parallel >= 1, "max_parallel", self.max_parallel, "at least 1")

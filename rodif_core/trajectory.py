@@ -1,0 +1,113 @@
+"""One recorded episode as frozen arrays, and its file form (npz, never pickle).
+
+Legend: N control steps, T decision steps, K denoising steps, To observation history,
+Tp predicted chunk, O observation dims, A action dims, Q position dims of the physics.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rodif_core.errors import TrajectoryFileError
+
+FORMAT_VERSION = 1
+_ARRAYS = (
+    "observations",
+    "actions",
+    "qpos",
+    "paths",
+    "histories",
+    "chains",
+    "decision_steps",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """An episode: what was seen, what was done, and the full denoising chain of every decision.
+
+    observations    (N + 1, O) float32; row 0 before the first action, row i after action i
+    actions         (N, A) float32; executed actions in task units (metres for Avoid)
+    qpos            (N + 1, Q) float32; physics positions, enough to draw every frame
+    paths           (N + 1, 3) float32; end-effector position in metres
+    histories       (T, To, O) float32; what the policy was conditioned on at each decision
+    chains          (T, K + 1, Tp, A) float32; normalised, unclamped; [:, 0] = a^K, [:, K] = a^0
+    decision_steps  (T,) int32; control step at which each chunk was chosen
+    context         start of the episode (JSON types), as the task sampled it
+    outcome         {"success": bool, "mode": str | None, "group": str | None, "reason": str, …}
+    info            task, seed, checkpoint digest, mujoco version, control_dt …
+
+    Scripted demonstrations have T = 0 decisions.
+    """
+
+    observations: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    qpos: NDArray[np.float32]
+    paths: NDArray[np.float32]
+    histories: NDArray[np.float32]
+    chains: NDArray[np.float32]
+    decision_steps: NDArray[np.int32]
+    context: dict[str, Any]
+    outcome: dict[str, Any]
+    info: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        n = len(self.actions)
+        for name in ("observations", "qpos", "paths"):
+            if len(getattr(self, name)) != n + 1:
+                raise TrajectoryFileError(
+                    f"{name} has {len(getattr(self, name))} rows; {n} actions need {n + 1}"
+                )
+        t = len(self.decision_steps)
+        if len(self.chains) != t or len(self.histories) != t:
+            raise TrajectoryFileError(
+                f"{t} decision steps, but {len(self.chains)} chains and {len(self.histories)} histories"
+            )
+        for name in _ARRAYS:
+            array = getattr(self, name)
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise TrajectoryFileError(f"{name} has values that are not finite")
+            array.setflags(write=False)
+
+    @property
+    def success(self) -> bool:
+        """Whether the task's goal was reached."""
+        return bool(self.outcome["success"])
+
+    def to_bytes(self) -> bytes:
+        """The file form: an npz archive with a JSON header; `from_bytes` reads it back."""
+        meta = {
+            "format": FORMAT_VERSION,
+            "context": self.context,
+            "outcome": self.outcome,
+            "info": self.info,
+        }
+        header = np.frombuffer(json.dumps(meta, sort_keys=True).encode(), dtype=np.uint8)
+        buffer = io.BytesIO()
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        np.savez_compressed(buffer, header=header, **arrays)
+        return buffer.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Trajectory:
+        """Read the file form; raises TrajectoryFileError when it is damaged or of another format."""
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                meta = json.loads(archive["header"].tobytes())
+                arrays = {name: archive[name] for name in _ARRAYS}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+            raise TrajectoryFileError(
+                f"not a readable episode file ({len(data)} bytes): {error}"
+            ) from error
+        if meta.get("format") != FORMAT_VERSION:
+            raise TrajectoryFileError(
+                f"episode file has format {meta.get('format')!r}; this version reads {FORMAT_VERSION}"
+            )
+        return cls(**arrays, context=meta["context"], outcome=meta["outcome"], info=meta["info"])
