@@ -25,7 +25,9 @@ class TaskName(StrEnum):
 class FinetuneMethod(StrEnum):
     """Fine-tuners that turn labels into a candidate policy."""
 
-    RODIF_GUIDED = "rodif_guided"  # our default: RoDiF scores the trajectories, guidance moves the policy
+    RODIF_GUIDED = (
+        "rodif_guided"  # our default: RoDiF scores the trajectories, guidance moves the policy
+    )
     RODIF = "rodif"  # the paper's robust loss (Eq. final_robust_loss)
     DP_DPO = "dp_dpo"  # the paper's baseline (Eq. dense_loss)
 
@@ -55,7 +57,9 @@ class FirstStep(StrEnum):
 class Scorer(StrEnum):
     """What turns noisy labels into one utility per trajectory in `rodif_guided`."""
 
-    NETWORK = "network"  # a few RoDiF updates on a throw-away copy; mean log-ratio of the trajectory
+    NETWORK = (
+        "network"  # a few RoDiF updates on a throw-away copy; mean log-ratio of the trajectory
+    )
     GAUSSIAN_PROCESS = "gaussian_process"  # Bradley-Terry with a Gaussian-process prior on the path
     COMBINED = "combined"  # mean of both, each standardised
 
@@ -125,7 +129,10 @@ class GuideConfig(_JsonConfig):
         _require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
         _require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
         _require(
-            self.selection_rollouts >= 10, "selection_rollouts", self.selection_rollouts, "at least 10"
+            self.selection_rollouts >= 10,
+            "selection_rollouts",
+            self.selection_rollouts,
+            "at least 10",
         )
         _require(
             0 <= self.self_training_rounds <= 5,
@@ -157,7 +164,9 @@ class FinetuneConfig(_JsonConfig):
     reduction: Reduction = Reduction.SUM
     group_size: int = 64  # pairs per outer logistic when reduction = group
     step_pairing: StepPairing = StepPairing.SAME_INDEX
-    matched_state_scale: float = 0.15  # length scale of `matched_state`, normalised observation units
+    matched_state_scale: float = (
+        0.15  # length scale of `matched_state`, normalised observation units
+    )
     executed_only: bool = False  # log-ratio over the executed part of the chunk only
     learning_rate: float = 3e-5
     updates: int = 30  # full-batch updates of `rodif` and `dp_dpo`
@@ -184,7 +193,9 @@ class FinetuneConfig(_JsonConfig):
             value = getattr(self, name)
             _require(math.isfinite(value) and value > 0, name, value, "a finite number above 0")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "in (0, 1]")
-        _require(self.matched_state_scale > 0, "matched_state_scale", self.matched_state_scale, "> 0")
+        _require(
+            self.matched_state_scale > 0, "matched_state_scale", self.matched_state_scale, "> 0"
+        )
         for name in ("updates", "chunk_rows", "group_size"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         _require(0 <= self.seed < 2**63, "seed", self.seed, "in [0, 2^63)")

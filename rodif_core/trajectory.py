@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,9 +91,15 @@ class Trajectory:
             "info": self.info,
         }
         header = np.frombuffer(json.dumps(meta, sort_keys=True).encode(), dtype=np.uint8)
+        arrays = {"header": header} | {name: getattr(self, name) for name in _ARRAYS}
         buffer = io.BytesIO()
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        np.savez_compressed(buffer, header=header, **arrays)
+        # numpy's own savez stamps the time of day into the archive; equal episodes must be equal bytes.
+        with zipfile.ZipFile(buffer, "w") as archive:
+            for name, array in arrays.items():
+                member = io.BytesIO()
+                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+                entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+                archive.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED)
         return buffer.getvalue()
 
     @classmethod
@@ -102,7 +109,7 @@ class Trajectory:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 meta = json.loads(archive["header"].tobytes())
                 arrays = {name: archive[name] for name in _ARRAYS}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise TrajectoryFileError(
                 f"not a readable episode file ({len(data)} bytes): {error}"
             ) from error
