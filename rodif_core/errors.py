@@ -6,7 +6,7 @@
     ├── TrajectoryFileError     an episode file that is missing, truncated or inconsistent
     ├── CheckpointFileError     a checkpoint file that is missing, truncated or inconsistent
     ├── SimulationDivergedError the physics of one simulation blew up
-    └── LearningError           fine-tuning or pretraining cannot go on (non-finite loss, no labels …)
+    └── LearningError           fine-tuning or pretraining cannot go on (no labels …)
 
 Every message names the offending value and the legal ones.
 """

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 
@@ -25,9 +25,7 @@ class TaskName(StrEnum):
 class FinetuneMethod(StrEnum):
     """Fine-tuners that turn labels into a candidate policy."""
 
-    RODIF_GUIDED = (
-        "rodif_guided"  # our default: RoDiF scores the trajectories, guidance moves the policy
-    )
+    RODIF_GUIDED = "rodif_guided"  # our default: RoDiF scores, guidance moves the policy
     RODIF = "rodif"  # the paper's robust loss (Eq. final_robust_loss)
     DP_DPO = "dp_dpo"  # the paper's baseline (Eq. dense_loss)
 
@@ -47,24 +45,18 @@ class StepPairing(StrEnum):
     MATCHED_STATE = "matched_state"  # the same, weighted by how far the two states still match
 
 
-class FirstStep(StrEnum):
-    """What happens to denoising step k = 1, whose posterior standard deviation is zero."""
-
-    DROP = "drop"  # deterministic when sampling, absent from the log-probability
-    FLOOR = "floor"  # the schedule's `std_floor` in sampling and in scoring
-
-
 class Scorer(StrEnum):
     """What turns noisy labels into one utility per trajectory in `rodif_guided`."""
 
-    NETWORK = (
-        "network"  # a few RoDiF updates on a throw-away copy; mean log-ratio of the trajectory
-    )
+    NETWORK = "network"  # a few RoDiF updates on a throw-away copy; mean log-ratio
     GAUSSIAN_PROCESS = "gaussian_process"  # Bradley-Terry with a Gaussian-process prior on the path
     COMBINED = "combined"  # mean of both, each standardised
 
 
-def parse_name[NameT: StrEnum](names: type[NameT], value: str, kind: str) -> NameT:
+NameT = TypeVar("NameT", bound=StrEnum)
+
+
+def parse_name(names: type[NameT], value: str, kind: str) -> NameT:
     """Turn text into a member of `names`; raises UnknownNameError listing the legal ones."""
     try:
         return names(value)
@@ -164,9 +156,7 @@ class FinetuneConfig(_JsonConfig):
     reduction: Reduction = Reduction.SUM
     group_size: int = 64  # pairs per outer logistic when reduction = group
     step_pairing: StepPairing = StepPairing.SAME_INDEX
-    matched_state_scale: float = (
-        0.15  # length scale of `matched_state`, normalised observation units
-    )
+    matched_state_scale: float = 0.15  # length scale, normalised observation units
     executed_only: bool = False  # log-ratio over the executed part of the chunk only
     learning_rate: float = 3e-5
     updates: int = 30  # full-batch updates of `rodif` and `dp_dpo`

@@ -69,7 +69,8 @@ class Trajectory:
         t = len(self.decision_steps)
         if len(self.chains) != t or len(self.histories) != t:
             raise TrajectoryFileError(
-                f"{t} decision steps, but {len(self.chains)} chains and {len(self.histories)} histories"
+                f"{t} decision steps, but {len(self.chains)} chains"
+                f" and {len(self.histories)} histories"
             )
         for name in _ARRAYS:
             array = getattr(self, name)
@@ -93,7 +94,8 @@ class Trajectory:
         header = np.frombuffer(json.dumps(meta, sort_keys=True).encode(), dtype=np.uint8)
         arrays = {"header": header} | {name: getattr(self, name) for name in _ARRAYS}
         buffer = io.BytesIO()
-        # numpy's own savez stamps the time of day into the archive; equal episodes must be equal bytes.
+        # numpy's own savez stamps the time of day into the archive, but equal episodes
+        # must be equal bytes.
         with zipfile.ZipFile(buffer, "w") as archive:
             for name, array in arrays.items():
                 member = io.BytesIO()
@@ -104,7 +106,7 @@ class Trajectory:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Trajectory:
-        """Read the file form; raises TrajectoryFileError when it is damaged or of another format."""
+        """Read the file form; raises TrajectoryFileError when it is damaged or foreign."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 meta = json.loads(archive["header"].tobytes())
@@ -115,6 +117,7 @@ class Trajectory:
             ) from error
         if meta.get("format") != FORMAT_VERSION:
             raise TrajectoryFileError(
-                f"episode file has format {meta.get('format')!r}; this version reads {FORMAT_VERSION}"
+                f"episode file has format {meta.get('format')!r};"
+                f" this version reads {FORMAT_VERSION}"
             )
         return cls(**arrays, context=meta["context"], outcome=meta["outcome"], info=meta["info"])
