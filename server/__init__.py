@@ -1,1 +1,1 @@
-
+"""REST service and SQL store. Never imports torch, mujoco or viser."""
