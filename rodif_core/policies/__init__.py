@@ -1,0 +1,1 @@
+"""Denoisers, the policy around them (history, chunks, normaliser) and its file form."""

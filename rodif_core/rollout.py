@@ -1,0 +1,153 @@
+"""Roll a policy out in many simulations at once and keep every denoising chain.
+
+Legend: B simulations stepped together, N control steps, T decision steps, K denoising steps,
+To observation history, Tp predicted chunk, Te executed chunk, O observation dims, A action dims.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rodif_core.diffusion.chain import noise_entries
+from rodif_core.policies.checkpoint import Checkpoint
+from rodif_core.policies.policy import DiffusionPolicy
+from rodif_core.spec import RolloutConfig
+from rodif_core.tasks import get_task
+from rodif_core.tasks.base import Task
+from rodif_core.tasks.env import BatchEnv
+from rodif_core.trajectory import Trajectory
+
+Progress = Callable[[int, int], None]  # episodes done, episodes in all
+
+
+def rollout(
+    checkpoint: Checkpoint, config: RolloutConfig, *, progress: Progress | None = None
+) -> list[Trajectory]:
+    """Run `config.episodes` episodes; episode i draws start and policy noise from seed + i.
+
+    The same checkpoint and config give the same bits on the same machine.
+    """
+    task = get_task(checkpoint.task)
+    done: list[Trajectory] = []
+    for first in range(0, config.episodes, config.max_parallel):
+        count = min(config.max_parallel, config.episodes - first)
+        seeds = [config.seed + first + i for i in range(count)]
+        done += _rollout_batch(checkpoint, task, seeds)
+        if progress is not None:
+            progress(len(done), config.episodes)
+    return done
+
+
+class _Recorder:
+    """Growing record of one episode."""
+
+    def __init__(self, observation: Any, qpos: Any, path: Any) -> None:
+        self.observations, self.qpos, self.paths = [observation], [qpos], [path]
+        self.actions: list[NDArray[np.float32]] = []
+        self.histories: list[NDArray[np.float32]] = []
+        self.chains: list[NDArray[np.float32]] = []
+        self.decision_steps: list[int] = []
+
+    def history(self, steps: int) -> NDArray[np.float32]:
+        """Last `steps` observations (To, O); before the start the first one is repeated."""
+        recent = self.observations[-steps:]
+        return np.stack([recent[0]] * (steps - len(recent)) + recent)
+
+    def decide(self, history: NDArray[np.float32], chain: NDArray[np.float32]) -> None:
+        """Note a decision taken at the present control step."""
+        self.decision_steps.append(len(self.actions))
+        self.histories.append(history)
+        self.chains.append(chain)
+
+    def step(self, action: Any, observation: Any, qpos: Any, path: Any) -> None:
+        """Note one executed control step."""
+        self.actions.append(action)
+        self.observations.append(observation)
+        self.qpos.append(qpos)
+        self.paths.append(path)
+
+
+def _rollout_batch(checkpoint: Checkpoint, task: Task, seeds: list[int]) -> list[Trajectory]:
+    policy = checkpoint.policy
+    size = policy.config
+    contexts = [task.sample_context(np.random.default_rng([seed, 0])) for seed in seeds]
+    generators = [_noise_generator(seed) for seed in seeds]
+    env = BatchEnv(task, len(seeds))
+    observations = env.reset(contexts)
+    qpos, paths = env.qpos, env.paths
+    records = [_Recorder(observations[i], qpos[i], paths[i]) for i in range(len(seeds))]
+    chunks = np.zeros((len(seeds), size.executed_steps, size.action_dim), dtype=np.float32)
+    step = 0
+    while not env.done.all():
+        active = np.flatnonzero(~env.done)
+        offset = step % size.executed_steps
+        if offset == 0:
+            _decide(policy, records, generators, active, chunks)
+        actions = np.clip(chunks[:, offset], -task.action_limit, task.action_limit)
+        observations = env.step(actions)
+        qpos, paths = env.qpos, env.paths
+        for i in active:
+            records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i])
+        step += 1
+    outcomes = env.outcomes()
+    return [
+        _finish(record, checkpoint, task, seed, context, outcome)
+        for record, seed, context, outcome in zip(records, seeds, contexts, outcomes, strict=True)
+    ]
+
+
+def _noise_generator(seed: int) -> torch.Generator:
+    # A stream of its own, so that the start of an episode and its policy noise are independent.
+    state = np.random.SeedSequence([seed, 1]).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+def _decide(
+    policy: DiffusionPolicy,
+    records: list[_Recorder],
+    generators: list[torch.Generator],
+    active: NDArray[np.intp],
+    chunks: NDArray[np.float32],
+) -> None:
+    size = policy.config
+    histories = np.stack([records[i].history(size.observation_steps) for i in active])
+    shape = (noise_entries(policy.schedule), size.predicted_steps, size.action_dim)
+    noise = torch.stack([torch.randn(shape, generator=generators[i]) for i in active])
+    actions, chains = policy.act(torch.from_numpy(histories), noise)
+    chunks[active] = actions.numpy()
+    for row, i in enumerate(active):
+        records[i].decide(histories[row], chains[row].numpy().copy())
+
+
+def _finish(
+    record: _Recorder,
+    checkpoint: Checkpoint,
+    task: Task,
+    seed: int,
+    context: dict[str, Any],
+    outcome: dict[str, Any],
+) -> Trajectory:
+    return Trajectory(
+        observations=np.stack(record.observations),
+        actions=np.stack(record.actions),
+        qpos=np.stack(record.qpos),
+        paths=np.stack(record.paths),
+        histories=np.stack(record.histories),
+        chains=np.stack(record.chains),
+        decision_steps=np.asarray(record.decision_steps, dtype=np.int32),
+        context=context,
+        outcome=outcome,
+        info={
+            "task": task.name.value,
+            "seed": seed,
+            "checkpoint": checkpoint.digest,
+            "mujoco_version": mujoco.__version__,
+            "control_dt": task.control_dt,
+        },
+    )
