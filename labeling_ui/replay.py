@@ -1,0 +1,248 @@
+"""Two episodes as one 3-D recording: A on the left, B on the right, one camera, one timeline.
+
+The recording is a `.viser` file, played by viser's own browser client. Equal inputs give equal
+bytes, so it can be stored by its hash. It says nothing about where the episodes come from: an
+annotator who opens the file finds "A", "B" and bodies, but no checkpoint and no mode.
+
+viser is imported when a replay is made, never before: it must not exist in a process that forks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labeling_ui.scene import Poses, Shape, body_poses, hit_geom, scene_model, smooth
+from labeling_ui.thumbnail import make_thumbnail
+from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.tasks.base import Task
+from rodif_core.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import viser
+
+__all__ = ["make_replay", "make_thumbnail"]
+
+SIDE_OFFSET = 0.48  # m; A's robot stands this far to the left of the middle, B's to the right
+MIDDLE_X = 0.38  # m in the robot's frame; what lies between the base and the far end of the reach
+SUBFRAMES = 2  # drawn frames per control step: 57 Hz, because the client does not interpolate
+HOLD = 1.2  # s; the last frame stays this long before the client starts again
+
+# Sky blue and orange stay apart for every common kind of colour blindness (Okabe & Ito 2008).
+SIDE_COLOURS = {"A": (0, 114, 178), "B": (213, 94, 0)}
+PALE = 0.5  # how far the trail that is still to come is mixed with white
+MAT_PALE = 0.84
+TABLE_COLOUR = (226, 224, 219)
+HIT_COLOUR = (255, 196, 0)
+BACKGROUND = ((236, 240, 244), (206, 213, 221))  # top, bottom
+
+CAMERA_POSITION = (0.0, -1.72, 1.42)
+CAMERA_LOOK_AT = (0.0, 0.02, 0.18)
+CAMERA_FOV = 0.72  # rad, vertical
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """What one half of the picture shows."""
+
+    name: str
+    origin: tuple[float, float, float]  # of the robot's frame, m
+    poses: Poses
+    path: NDArray[np.float32]  # (N + 1, 3), m
+    hit: int | None  # geom that ended the episode
+
+
+def make_replay(task: Task, left: Trajectory, right: Trajectory) -> bytes:
+    """A `.viser` recording of two episodes of `task`, `left` as A and `right` as B.
+
+    Both start together; the shorter one waits in its last pose. Raises ValueOutOfRangeError when an
+    episode's physics positions do not fit the task.
+    """
+    import viser
+
+    model = scene_model(task).model
+    for side, trajectory in (("left", left), ("right", right)):
+        if trajectory.qpos.shape[1] != model.nq:
+            raise ValueOutOfRangeError(
+                f"qpos width of the {side} episode",
+                trajectory.qpos.shape[1],
+                f"{model.nq}, the positions of task {str(task.name)!r}",
+            )
+    sides = (
+        _side("A", -SIDE_OFFSET - MIDDLE_X, task, left),
+        _side("B", SIDE_OFFSET - MIDDLE_X, task, right),
+    )
+    # viser prints a banner whatever its settings say; a worker's log is no place for it.
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            return _record(server, task, sides)
+        finally:
+            server.stop()
+
+
+def _side(name: str, x: float, task: Task, trajectory: Trajectory) -> _Side:
+    poses = smooth(body_poses(scene_model(task).model, trajectory.qpos), SUBFRAMES)
+    return _Side(name, (x, 0.0, 0.0), poses, trajectory.paths, hit_geom(task, trajectory))
+
+
+def _record(server: viser.ViserServer, task: Task, sides: tuple[_Side, _Side]) -> bytes:
+    scene = server.scene
+    _set_stage(server)
+    tracks = [_Track(scene, side, scene_model(task).shapes) for side in sides]
+    for track in tracks:
+        track.show(0)
+    recording = server.get_scene_serializer()
+    step = task.control_dt / SUBFRAMES
+    for frame in range(1, max(len(side.poses) for side in sides)):
+        recording.insert_sleep(step)
+        for track in tracks:
+            track.show(frame)
+    recording.insert_sleep(HOLD)
+    return recording.serialize()
+
+
+def _set_stage(server: viser.ViserServer) -> None:
+    """Camera, light, background and the common table top."""
+    camera = server.initial_camera
+    camera.position, camera.look_at, camera.fov = CAMERA_POSITION, CAMERA_LOOK_AT, CAMERA_FOV
+    scene = server.scene
+    scene.set_up_direction("+z")
+    # Without the built-in environment map the picture is there ten times sooner on slow machines.
+    scene.configure_environment_map(None)
+    scene.configure_default_lights(True, cast_shadow=False)
+    scene.add_light_hemisphere("/light", intensity=2.0)
+    top, bottom = (np.array(colour, dtype=np.float64) for colour in BACKGROUND)
+    share = np.linspace(0.0, 1.0, 64)[:, None, None]
+    gradient = np.round((1 - share) * top + share * bottom).astype(np.uint8)
+    scene.set_background_image(np.repeat(gradient, 4, axis=1), format="png")
+    width = 4 * SIDE_OFFSET + 0.1
+    scene.add_box(
+        "/table",
+        color=TABLE_COLOUR,
+        dimensions=(width, 1.16, 0.04),
+        position=(0.0, 0.02, -0.022),
+        cast_shadow=False,
+    )
+
+
+class _Track:
+    """The nodes of one side, and what must be sent to show a frame."""
+
+    def __init__(self, scene: Any, side: _Side, shapes: tuple[Shape, ...]) -> None:
+        self._side = side
+        root = f"/{side.name}"
+        scene.add_frame(root, show_axes=False, position=side.origin)
+        self._bodies: dict[int, Any] = {}
+        for shape in shapes:
+            if shape.body not in self._bodies:
+                self._bodies[shape.body] = scene.add_frame(f"{root}/b{shape.body}", show_axes=False)
+            _add_shape(scene, f"{root}/b{shape.body}/g{shape.geom}", shape)
+        self._add_surroundings(scene, root)
+        self._trail = self._add_trail(scene, root)
+        self._hit = _add_hit(scene, root, shapes, side.hit)
+        self._shown: dict[int, tuple[bytes, bytes]] = {}
+
+    def _add_surroundings(self, scene: Any, root: str) -> None:
+        """A tinted mat under the work space and the side's letter in front of it."""
+        colour = SIDE_COLOURS[self._side.name]
+        scene.add_box(
+            f"{root}/mat",
+            color=_mix(colour, MAT_PALE),
+            dimensions=(0.56, 0.86, 0.003),
+            position=(0.5, 0.0, -0.0008),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        scene.add_label(
+            f"{root}/label", self._side.name, position=(0.5, -0.5, 0.03), font_screen_scale=2.2
+        )
+
+    def _add_trail(self, scene: Any, root: str) -> list[Any]:
+        """A pale line over the whole path, and strong pieces that appear as the rod moves."""
+        colour = SIDE_COLOURS[self._side.name]
+        points = np.asarray(self._side.path, dtype=np.float32)
+        pieces = np.stack([points[:-1], points[1:]], axis=1)
+        below = pieces - np.array([0.0, 0.0, 0.004], dtype=np.float32)  # else the two lines mix
+        scene.add_line_segments(
+            f"{root}/path", below, _mix(colour, PALE), thickness=2.0, thickness_units="screen"
+        )
+        return [
+            scene.add_line_segments(
+                f"{root}/trail/{index}",
+                pieces[index : index + 1],
+                colour,
+                thickness=5.0,
+                thickness_units="screen",
+                visible=False,
+            )
+            for index in range(len(pieces))
+        ]
+
+    def show(self, frame: int) -> None:
+        """Send what changes at `frame`; frames after the last one change nothing."""
+        poses = self._side.poses
+        if frame >= len(poses):
+            return
+        for body, handle in self._bodies.items():
+            position, wxyz = poses.positions[frame, body], poses.wxyz[frame, body]
+            pose = (position.tobytes(), wxyz.tobytes())
+            if self._shown.get(body) != pose:
+                self._shown[body] = pose
+                handle.position, handle.wxyz = position, wxyz
+        if frame and frame % SUBFRAMES == 0:
+            self._trail[frame // SUBFRAMES - 1].visible = True
+        if frame == len(poses) - 1:
+            for handle in self._hit:
+                handle.visible = True
+
+
+def _add_shape(scene: Any, name: str, shape: Shape, **changes: Any) -> Any:
+    place = {
+        "color": shape.colour,
+        "position": shape.position,
+        "wxyz": shape.wxyz,
+        "opacity": None if shape.opacity >= 1 else shape.opacity,
+        "cast_shadow": False,
+        "receive_shadow": False,
+    } | changes
+    grown = place.pop("grown", 1.0)
+    if shape.kind == "box":
+        size = tuple(2 * grown * half for half in shape.size)
+        return scene.add_box(name, dimensions=size, **place)
+    if shape.kind == "sphere":
+        return scene.add_icosphere(name, radius=grown * shape.size[0], subdivisions=3, **place)
+    if shape.kind == "cylinder":
+        radius, half = shape.size
+        return scene.add_cylinder(
+            name, radius=grown * radius, height=2 * grown * half, radial_segments=40, **place
+        )
+    return scene.add_mesh_simple(name, shape.vertices, shape.faces, scale=grown, **place)
+
+
+def _add_hit(scene: Any, root: str, shapes: tuple[Shape, ...], hit: int | None) -> list[Any]:
+    """What appears when the rod has touched an object: the object in another colour."""
+    for shape in shapes:
+        if shape.geom == hit:
+            name = f"{root}/b{shape.body}/touched"
+            body = _add_shape(scene, name, shape, color=HIT_COLOUR, grown=1.02, visible=False)
+            above = shape.position + np.array([0.0, 0.0, shape.size[-1] + 0.06])
+            label = scene.add_label(
+                f"{root}/b{shape.body}/touched_label",
+                "touched",
+                position=above,
+                font_screen_scale=1.1,
+                visible=False,
+            )
+            return [body, label]
+    return []
+
+
+def _mix(colour: tuple[int, int, int], white: float) -> tuple[int, int, int]:
+    red, green, blue = (round(value + (255 - value) * white) for value in colour)
+    return red, green, blue

@@ -1,0 +1,148 @@
+"""A small moving picture of a pair, for lists and for browsers without WebGL.
+
+It is a top-down drawing of both paths, made by Pillow from the task's scene facts: the same bytes
+on every machine, no graphics driver, and nothing that could hang in a forked worker. A rendered
+arm would hide the very path that the picture is for.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from rodif_core.tasks.base import COLLISION, Task
+from rodif_core.trajectory import Trajectory
+
+PANEL = (140, 184)  # px of each side
+HEADER = 24  # px above the drawing, for the letter
+GAP = 6  # px between the sides
+FRAMES = 18  # moving frames; one more is held at the end
+FRAME_MS = 110
+HOLD_MS = 1400
+DETAIL = 3  # drawn this many times larger, then scaled down for smooth edges
+
+INK = (38, 45, 56)
+PAPER = (246, 247, 249)
+HIT_COLOUR = (255, 196, 0)
+SIDE_COLOURS = {"A": (0, 114, 178), "B": (213, 94, 0)}
+MARGIN = 0.03  # m around the work space
+
+
+@dataclass(frozen=True)
+class _Map:
+    """From metres to pixels: x to the right, y up."""
+
+    scale: float
+    left: float  # px of x = 0
+    bottom: float  # px of y = 0
+
+    def point(self, x: float, y: float) -> tuple[float, float]:
+        return self.left + self.scale * x, self.bottom - self.scale * y
+
+    def disc(self, x: float, y: float, radius: float) -> tuple[float, float, float, float]:
+        """Bounding box of a disc of `radius` metres."""
+        (u, v), r = self.point(x, y), self.scale * radius
+        return u - r, v - r, u + r, v + r
+
+
+def make_thumbnail(task: Task, left: Trajectory, right: Trajectory) -> bytes:
+    """Animated webp (286 x 208 px) of both paths seen from above, `left` as A, `right` as B.
+
+    Both run at the same speed; the last frame, with both whole paths, is held.
+    """
+    longest = max(len(left.paths), len(right.paths))
+    ends = np.unique(np.linspace(1, longest, FRAMES).astype(int))
+    shapes = task.scene_shapes()
+    frames = [_frame(shapes, left, right, int(end)) for end in ends]
+    durations = [FRAME_MS] * (len(frames) - 1) + [HOLD_MS]
+    buffer = io.BytesIO()
+    imageio.imwrite(
+        buffer,
+        np.stack(frames),
+        extension=".webp",
+        plugin="pillow",
+        duration=durations,
+        loop=0,
+        quality=70,
+        method=4,
+    )
+    return buffer.getvalue()
+
+
+def _frame(
+    shapes: Sequence[Mapping[str, Any]], left: Trajectory, right: Trajectory, end: int
+) -> NDArray[np.uint8]:
+    """(208, 286, 3) uint8: both paths up to row `end`."""
+    width, height = 2 * PANEL[0] + GAP, PANEL[1] + HEADER
+    picture = Image.new("RGB", (width, height), PAPER)
+    for name, trajectory, x in (("A", left, 0), ("B", right, PANEL[0] + GAP)):
+        picture.paste(_panel(name, shapes, trajectory, end), (x, 0))
+    return np.asarray(picture)
+
+
+def _panel(
+    name: str, shapes: Sequence[Mapping[str, Any]], trajectory: Trajectory, end: int
+) -> Image.Image:
+    size = (PANEL[0] * DETAIL, (PANEL[1] + HEADER) * DETAIL)
+    panel = Image.new("RGB", size, (255, 255, 255))
+    draw = ImageDraw.Draw(panel)
+    place = _fit(shapes)
+    colour = SIDE_COLOURS[name]
+    for shape in shapes:
+        _draw_shape(draw, place, shape)
+    path = [place.point(float(x), float(y)) for x, y in trajectory.paths[:, :2]]
+    draw.line(path, fill=_pale(colour), width=DETAIL, joint="curve")
+    done = path[:end]
+    if len(done) > 1:
+        draw.line(done, fill=colour, width=3 * DETAIL, joint="curve")
+    x, y = (float(value) for value in trajectory.paths[min(end, len(path)) - 1, :2])
+    stopped = end >= len(path) and trajectory.outcome.get("reason") == COLLISION
+    tip = HIT_COLOUR if stopped else INK
+    draw.ellipse(place.disc(x, y, 0.016), fill=tip, outline=INK, width=DETAIL)
+    draw.rectangle((0, 0, size[0], (HEADER - 2) * DETAIL), fill=colour)
+    font = ImageFont.load_default(size=15 * DETAIL)
+    centre = (size[0] / 2, (HEADER - 2) * DETAIL / 2)
+    draw.text(centre, name, fill=(255, 255, 255), font=font, anchor="mm")
+    return panel.resize((PANEL[0], PANEL[1] + HEADER), Image.Resampling.LANCZOS)
+
+
+def _fit(shapes: Sequence[Mapping[str, Any]]) -> _Map:
+    """The largest map that shows the whole work space below the header."""
+    box = next(shape for shape in shapes if shape["type"] == "workspace")
+    x0, x1 = box["x0"] - MARGIN, box["x1"] + MARGIN
+    y0, y1 = box["y0"] - MARGIN, box["y1"] + 3 * MARGIN  # paths end a little behind the finish
+    width, height = PANEL[0] * DETAIL, PANEL[1] * DETAIL
+    scale = min(width / (x1 - x0), height / (y1 - y0))
+    left = width / 2 - scale * (x0 + x1) / 2
+    bottom = HEADER * DETAIL + height / 2 + scale * (y0 + y1) / 2
+    return _Map(scale, left, bottom)
+
+
+def _draw_shape(draw: ImageDraw.ImageDraw, place: _Map, shape: Mapping[str, Any]) -> None:
+    kind = shape["type"]
+    if kind == "cylinder":
+        draw.ellipse(place.disc(shape["x"], shape["y"], shape["radius"]), fill=shape["colour"])
+    elif kind == "finish":
+        line = [place.point(shape["x0"], shape["y"]), place.point(shape["x1"], shape["y"])]
+        draw.line(line, fill=shape["colour"], width=3 * DETAIL)
+    elif kind == "workspace":
+        corner, other = place.point(shape["x0"], shape["y1"]), place.point(shape["x1"], shape["y0"])
+        draw.rectangle((*corner, *other), outline=(222, 226, 231), width=DETAIL)
+    elif kind == "start":
+        draw.ellipse(place.disc(shape["x"], shape["y"], 0.010), outline=INK, width=DETAIL)
+    else:
+        raise ValueError(
+            f"scene shape of type {kind!r}; legal are cylinder, finish, workspace and start"
+        )
+
+
+def _pale(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    red, green, blue = (round(value + (255 - value) * 0.6) for value in colour)
+    return red, green, blue
