@@ -131,8 +131,12 @@ class Checkpoint(Base):
     digest: Mapped[str] = mapped_column(String(64))  # rodif_core checkpoint digest
     artifact_sha256: Mapped[str] = mapped_column(String(64))
     parent_id: Mapped[int | None] = mapped_column(ForeignKey("checkpoint.id"))
-    round_id: Mapped[int | None] = mapped_column(ForeignKey("round.id"), unique=True)
-    snapshot_digest: Mapped[str | None] = mapped_column(ForeignKey("label_snapshot.digest"))
+    round_id: Mapped[int | None] = mapped_column(
+        ForeignKey("round.id", use_alter=True), unique=True
+    )
+    snapshot_digest: Mapped[str | None] = mapped_column(
+        ForeignKey("label_snapshot.digest", use_alter=True)
+    )
     config: Mapped[dict[str, Any]]
     metrics: Mapped[dict[str, Any]]
     code_version: Mapped[str] = mapped_column(String(64))

@@ -1,0 +1,109 @@
+"""From exceptions to `application/problem+json` (RFC 9457). One table decides the status."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from rodif_core.errors import RodifError, UnknownNameError, ValueOutOfRangeError
+from server.errors import (
+    ArtifactError,
+    ConflictError,
+    DatabaseVersionError,
+    LeaseLostError,
+    NotAllowedError,
+    NotFoundError,
+    NotSignedInError,
+    ThrottledError,
+)
+
+logger = logging.getLogger(__name__)
+
+STATUS_OF: dict[type[RodifError], HTTPStatus] = {
+    NotSignedInError: HTTPStatus.UNAUTHORIZED,
+    NotAllowedError: HTTPStatus.FORBIDDEN,
+    NotFoundError: HTTPStatus.NOT_FOUND,
+    ArtifactError: HTTPStatus.NOT_FOUND,
+    ConflictError: HTTPStatus.CONFLICT,
+    LeaseLostError: HTTPStatus.CONFLICT,
+    UnknownNameError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    ValueOutOfRangeError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    ThrottledError: HTTPStatus.TOO_MANY_REQUESTS,
+    DatabaseVersionError: HTTPStatus.SERVICE_UNAVAILABLE,
+}
+PROBLEM_TYPE = "application/problem+json"
+
+
+def problem(
+    status: int,
+    detail: str,
+    *,
+    errors: list[dict[str, Any]] | None = None,
+    headers: dict[str, str] | None = None,
+) -> JSONResponse:
+    """An error answer; `errors` lists fields of the request that do not fit."""
+    body: dict[str, Any] = {
+        "type": "about:blank",
+        "title": HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+    }
+    if errors is not None:
+        body["errors"] = errors
+    return JSONResponse(body, status_code=status, headers=headers, media_type=PROBLEM_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Register the handlers below."""
+    app.add_exception_handler(RodifError, _rodif_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unexpected_error)
+
+
+def _rodif_error(_request: Request, error: Exception) -> JSONResponse:
+    status = next(
+        (STATUS_OF[kind] for kind in type(error).__mro__ if kind in STATUS_OF),
+        HTTPStatus.BAD_REQUEST,
+    )
+    headers = {}
+    if isinstance(error, ThrottledError):
+        headers["Retry-After"] = str(error.retry_after)
+    if isinstance(error, NotSignedInError):
+        headers["WWW-Authenticate"] = "Bearer"
+    errors = None
+    if isinstance(error, UnknownNameError | ValueOutOfRangeError):
+        name = error.kind if isinstance(error, UnknownNameError) else error.name
+        legal = list(error.legal) if isinstance(error.legal, tuple) else error.legal
+        legal = [str(item) for item in legal] if isinstance(legal, list) else legal
+        errors = [{"field": name, "message": str(error), "legal": legal}]
+    return problem(status, str(error), errors=errors, headers=headers)
+
+
+def _validation_error(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    found = [
+        {"field": ".".join(str(part) for part in item["loc"]), "message": item["msg"]}
+        for item in error.errors()
+    ]
+    if any(item["type"] == "json_invalid" for item in error.errors()):
+        return problem(HTTPStatus.BAD_REQUEST, "the body is not JSON", errors=found)
+    fields = "; ".join(f"{item['field']}: {item['message']}" for item in found)
+    return problem(HTTPStatus.UNPROCESSABLE_ENTITY, fields, errors=found)
+
+
+def _http_error(_request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    headers = dict(error.headers) if error.headers else None
+    return problem(error.status_code, str(error.detail), headers=headers)
+
+
+def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
+    logger.error("unexpected error in %s %s", request.method, request.url.path, exc_info=error)
+    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, "unexpected error; the log has the details")

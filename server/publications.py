@@ -1,0 +1,132 @@
+"""The published policy of a campaign is an alias that moves; every move is a row."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from server.errors import ConflictError, NotFoundError
+from server.states import PublishRule
+from server.store.events import add_event, audit
+from server.store.tables import Campaign, Checkpoint, Publication, Round
+
+
+def publish(
+    session: Session,
+    now: datetime,
+    *,
+    campaign_id: int,
+    checkpoint_id: int,
+    reason: str,
+    by: int | None,
+) -> Publication:
+    """Move the alias to `checkpoint_id`; `by` None means that the gate of a round did it.
+
+    Raises NotFoundError, or ConflictError for a checkpoint of another task, of a comparison round,
+    or one that is published already.
+    """
+    campaign = _locked_campaign(session, campaign_id)
+    checkpoint = session.get(Checkpoint, checkpoint_id)
+    if checkpoint is None:
+        raise NotFoundError("checkpoint", checkpoint_id)
+    if checkpoint.task != campaign.task:
+        raise ConflictError(
+            f"checkpoint {checkpoint_id} is for task {checkpoint.task!r},"
+            f" campaign {campaign_id} for {campaign.task!r}"
+        )
+    if checkpoint.id == campaign.published_checkpoint_id:
+        raise ConflictError(f"checkpoint {checkpoint_id} is published already")
+    if checkpoint.round_id is not None:
+        parent_round = session.get_one(Round, checkpoint.round_id)
+        if parent_round.publish_rule == PublishRule.NEVER:
+            raise ConflictError(
+                f"checkpoint {checkpoint_id} comes from comparison round {parent_round.id}"
+                " (publish_rule 'never'), which is never published"
+            )
+    return _move(session, now, campaign, checkpoint.id, action="publish", reason=reason, by=by)
+
+
+def rollback(
+    session: Session, now: datetime, *, campaign_id: int, reason: str, by: int | None
+) -> Publication:
+    """Move the alias back to what was published before; raises ConflictError at the start."""
+    campaign = _locked_campaign(session, campaign_id)
+    history = session.scalars(
+        select(Publication).where(Publication.campaign_id == campaign_id).order_by(Publication.id)
+    )
+    stack: list[int] = []
+    for row in history:
+        if row.action == "rollback":
+            stack.pop()
+        else:
+            stack.append(row.checkpoint_id)
+    if len(stack) < 2:
+        raise ConflictError(
+            f"campaign {campaign_id} is at its starting checkpoint; there is nothing to roll back"
+        )
+    return _move(session, now, campaign, stack[-2], action="rollback", reason=reason, by=by)
+
+
+def record_start(session: Session, now: datetime, campaign: Campaign, *, by: int | None) -> None:
+    """First row of a new campaign's history."""
+    session.add(
+        Publication(
+            campaign_id=campaign.id,
+            checkpoint_id=campaign.published_checkpoint_id,
+            previous_checkpoint_id=None,
+            action="start",
+            reason="campaign created",
+            by_annotator_id=by,
+            at=now,
+        )
+    )
+
+
+def _locked_campaign(session: Session, campaign_id: int) -> Campaign:
+    campaign = session.get(Campaign, campaign_id, with_for_update=True, populate_existing=True)
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    return campaign
+
+
+def _move(
+    session: Session,
+    now: datetime,
+    campaign: Campaign,
+    checkpoint_id: int,
+    *,
+    action: str,
+    reason: str,
+    by: int | None,
+) -> Publication:
+    publication = Publication(
+        campaign_id=campaign.id,
+        checkpoint_id=checkpoint_id,
+        previous_checkpoint_id=campaign.published_checkpoint_id,
+        action=action,
+        reason=reason,
+        by_annotator_id=by,
+        at=now,
+    )
+    moved = {"from": campaign.published_checkpoint_id, "to": checkpoint_id, "reason": reason}
+    campaign.published_checkpoint_id = checkpoint_id
+    session.add(publication)
+    audit(
+        session,
+        now,
+        actor_id=by,
+        action=f"campaign.{action}",
+        subject=f"campaign/{campaign.id}",
+        details=moved,
+    )
+    add_event(
+        session,
+        now,
+        campaign_id=campaign.id,
+        kind="publication",
+        data={"action": action, "checkpoint_id": checkpoint_id, "reason": reason},
+    )
+    session.flush()
+    return publication

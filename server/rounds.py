@@ -1,0 +1,333 @@
+"""Rounds: freeze a label snapshot, launch, move through the states, cancel, and what is due.
+
+queued → finetuning → evaluating → gating → published | rejected | kept
+any state before the last three → failed | cancelled; a failed one can be taken up again
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from rodif_core.spec import FinetuneConfig
+from server.errors import ConflictError, NotFoundError
+from server.finetune_config import complete_config
+from server.states import (
+    Choice,
+    JobKind,
+    JobState,
+    PairState,
+    PublishRule,
+    RoundState,
+    RoundTrigger,
+)
+from server.store import jobs
+from server.store.events import add_event, audit
+from server.store.labels import effective_label_ids, snapshot_labels
+from server.store.tables import Campaign, Job, LabelSnapshot, Pair, Round
+
+FINAL_STATES = frozenset(
+    {
+        RoundState.PUBLISHED,
+        RoundState.REJECTED,
+        RoundState.KEPT,
+        RoundState.FAILED,
+        RoundState.CANCELLED,
+    }
+)
+_ENDINGS = frozenset({RoundState.FAILED, RoundState.CANCELLED})
+_TRANSITIONS: dict[RoundState, frozenset[RoundState]] = {
+    RoundState.QUEUED: _ENDINGS | {RoundState.FINETUNING},
+    RoundState.FINETUNING: _ENDINGS | {RoundState.EVALUATING},
+    RoundState.EVALUATING: _ENDINGS | {RoundState.GATING},
+    RoundState.GATING: _ENDINGS | {RoundState.PUBLISHED, RoundState.REJECTED, RoundState.KEPT},
+}
+# Where a failed round goes on when the failed job is retried.
+_STATE_OF_RETRIED: dict[JobKind, RoundState] = {
+    JobKind.FINETUNE: RoundState.QUEUED,
+    JobKind.EVALUATE: RoundState.EVALUATING,
+    JobKind.PUBLISH: RoundState.GATING,
+}
+# Evaluations share their seeds, so that a parent is evaluated once and compared like with like;
+# collect jobs count up from 0 and stay far below.
+EVALUATION_SEED = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class RoundRequest:
+    """What a client or the tick asks for; None means the campaign's setting."""
+
+    config: dict[str, Any] | None = None  # partial FinetuneConfig
+    publish_rule: PublishRule | None = None
+    evaluation: dict[str, int] | None = None  # {"episodes": n, "seed": s}, each optional
+    snapshot_digest: str | None = None  # reuse a frozen snapshot
+    seed: int | None = None  # of the fine-tuning
+
+
+def freeze_snapshot(session: Session, now: datetime, campaign_id: int) -> LabelSnapshot:
+    """Freeze the labels that hold now; equal sets share one row. May be empty."""
+    label_ids = effective_label_ids(session, campaign_id)
+    digest = snapshot_digest(campaign_id, label_ids)
+    snapshot = session.get(LabelSnapshot, digest)
+    if snapshot is None:
+        snapshot = LabelSnapshot(
+            digest=digest,
+            campaign_id=campaign_id,
+            label_ids=label_ids,
+            size=len(label_ids),
+            created_at=now,
+        )
+        session.add(snapshot)
+        session.flush()
+    return snapshot
+
+
+def snapshot_digest(campaign_id: int, label_ids: Sequence[int]) -> str:
+    """SHA-256 of the canonical JSON of campaign and ordered label ids."""
+    content = {"campaign_id": campaign_id, "label_ids": list(label_ids)}
+    return hashlib.sha256(
+        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
+
+
+def launch(
+    session: Session,
+    now: datetime,
+    campaign_id: int,
+    request: RoundRequest,
+    *,
+    trigger: RoundTrigger = RoundTrigger.MANUAL,
+    started_by: int | None = None,
+) -> Round:
+    """Freeze the snapshot, store the round, queue its fine-tuning.
+
+    Raises NotFoundError; ConflictError when no label says which one is better, or when another
+    round of the campaign may still publish; UnknownNameError or ValueOutOfRangeError for a wrong
+    configuration.
+    """
+    campaign = session.get(Campaign, campaign_id, with_for_update=True, populate_existing=True)
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    if campaign.archived:
+        raise ConflictError(f"campaign {campaign_id} is archived")
+    settings = campaign.settings
+    publish_rule = PublishRule(request.publish_rule or settings["publish_rule"])
+    config = _config(request, method=settings["method"])
+    if publish_rule != PublishRule.NEVER:
+        _refuse_second_publishing_round(session, campaign_id)
+    snapshot = _snapshot(session, now, campaign_id, request.snapshot_digest)
+    evaluation = {"episodes": settings["evaluation_episodes"], "seed": EVALUATION_SEED}
+    new_round = Round(
+        campaign_id=campaign_id,
+        parent_checkpoint_id=campaign.published_checkpoint_id,
+        snapshot_digest=snapshot.digest,
+        trigger=trigger,
+        publish_rule=publish_rule,
+        config=config.to_json(),
+        evaluation=evaluation | (request.evaluation or {}),
+        started_by=started_by,
+        created_at=now,
+    )
+    session.add(new_round)
+    session.flush()
+    jobs.enqueue(
+        session,
+        now,
+        kind=JobKind.FINETUNE,
+        campaign_id=campaign_id,
+        round_id=new_round.id,
+        payload={},
+        dedupe_key=f"finetune:{new_round.id}",
+        created_by=started_by,
+    )
+    _tell(session, now, new_round)
+    audit(
+        session,
+        now,
+        actor_id=started_by,
+        action="round.launch",
+        subject=f"round/{new_round.id}",
+        details={"trigger": trigger, "snapshot_digest": snapshot.digest},
+    )
+    return new_round
+
+
+def _config(request: RoundRequest, *, method: str) -> FinetuneConfig:
+    partial = dict(request.config or {})
+    if request.seed is not None:
+        partial["seed"] = request.seed
+    return complete_config(partial, method=method)
+
+
+def _refuse_second_publishing_round(session: Session, campaign_id: int) -> None:
+    running = session.scalars(_publishing(campaign_id).limit(1)).one_or_none()
+    if running is not None:
+        raise ConflictError(
+            f"round {running.id} of campaign {campaign_id} is {running.state!r} and may publish;"
+            " wait for it, cancel it, or start a comparison round with publish_rule 'never'"
+        )
+
+
+def _publishing(campaign_id: int) -> Any:
+    return select(Round).where(
+        Round.campaign_id == campaign_id,
+        Round.publish_rule != PublishRule.NEVER,
+        Round.state.not_in(FINAL_STATES),
+    )
+
+
+def _snapshot(
+    session: Session, now: datetime, campaign_id: int, digest: str | None
+) -> LabelSnapshot:
+    if digest is None:
+        snapshot = freeze_snapshot(session, now, campaign_id)
+    else:
+        found = session.get(LabelSnapshot, digest)
+        if found is None or found.campaign_id != campaign_id:
+            raise NotFoundError(f"label snapshot of campaign {campaign_id}", digest)
+        snapshot = found
+    usable = {Choice.FIRST, Choice.SECOND}
+    if not any(row.choice in usable for row in snapshot_labels(session, snapshot.digest)):
+        raise ConflictError(
+            f"campaign {campaign_id} has {snapshot.size} labels in force, but none says which"
+            " episode is better; collect labels first"
+        )
+    return snapshot
+
+
+def move(
+    session: Session, now: datetime, round_id: int, to: RoundState, *, error: str | None = None
+) -> Round:
+    """Take the round to another state and tell the browsers; to the same state is no change.
+
+    Raises ConflictError for a step that the diagram above does not have.
+    """
+    found = session.get(Round, round_id, with_for_update=True, populate_existing=True)
+    if found is None:
+        raise NotFoundError("round", round_id)
+    state = RoundState(found.state)
+    if state == to:
+        return found
+    legal = _TRANSITIONS.get(state, frozenset())
+    if to not in legal:
+        raise ConflictError(
+            f"round {round_id} is {state.value!r} and cannot become {to.value!r};"
+            f" legal are {sorted(item.value for item in legal)}"
+        )
+    found.state = to
+    if error is not None:
+        found.error = error
+    if to in FINAL_STATES:
+        found.finished_at = now
+    _tell(session, now, found)
+    session.flush()
+    return found
+
+
+def _tell(session: Session, now: datetime, changed: Round) -> None:
+    data = {"round_id": changed.id, "state": str(changed.state), "error": changed.error}
+    add_event(
+        session,
+        now,
+        campaign_id=changed.campaign_id,
+        round_id=changed.id,
+        kind="round",
+        data=data,
+    )
+
+
+def cancel(session: Session, now: datetime, round_id: int, *, by: int | None) -> Round:
+    """Cancel the round and its unfinished jobs; raises ConflictError when it has ended."""
+    cancelled = move(session, now, round_id, RoundState.CANCELLED)
+    unfinished = select(Job.id).where(
+        Job.round_id == round_id, Job.state.in_((JobState.QUEUED, JobState.RUNNING))
+    )
+    for job_id in list(session.scalars(unfinished)):
+        jobs.cancel(session, now, job_id)
+    audit(session, now, actor_id=by, action="round.cancel", subject=f"round/{round_id}")
+    return cancelled
+
+
+def retry_job(session: Session, now: datetime, job_id: int, *, by: int | None) -> Job:
+    """Queue a failed job again, and take up its round or its pair where it stopped."""
+    job = jobs.retry(session, now, job_id)
+    if job.round_id is not None:
+        failed = session.get_one(Round, job.round_id, with_for_update=True)
+        if failed.state == RoundState.FAILED:
+            if failed.publish_rule != PublishRule.NEVER:
+                _refuse_second_publishing_round(session, failed.campaign_id)
+            failed.state = _STATE_OF_RETRIED[JobKind(job.kind)]
+            failed.error = None
+            failed.finished_at = None
+            _tell(session, now, failed)
+    if job.pair_id is not None:
+        pair = session.get_one(Pair, job.pair_id)
+        if pair.state == PairState.FAILED:
+            pair.state = PairState.WAITING
+    audit(session, now, actor_id=by, action="job.retry", subject=f"job/{job_id}")
+    session.flush()
+    return job
+
+
+def new_labels_since_round(session: Session, campaign_id: int) -> int:
+    """Labels in force that no earlier publishing round has learned from."""
+    used: set[int] = set()
+    snapshots = (
+        select(LabelSnapshot.label_ids)
+        .join(Round, Round.snapshot_digest == LabelSnapshot.digest)
+        .where(Round.campaign_id == campaign_id, Round.publish_rule != PublishRule.NEVER)
+        .order_by(Round.id.desc())
+        .limit(1)
+    )
+    for label_ids in session.scalars(snapshots):
+        used.update(label_ids)
+    return sum(label_id not in used for label_id in effective_label_ids(session, campaign_id))
+
+
+def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger | None:
+    """Why a round of this campaign should start now, by its settings; None when it should not."""
+    every_labels = int(campaign.settings["round_after_labels"])
+    every_minutes = float(campaign.settings["round_every_minutes"])
+    if campaign.archived or (every_labels == 0 and every_minutes == 0):
+        return None
+    if session.scalars(_publishing(campaign.id).limit(1)).first() is not None:
+        return None
+    new_labels = new_labels_since_round(session, campaign.id)
+    if every_labels > 0 and new_labels >= every_labels:
+        return RoundTrigger.LABELS
+    last_start = session.scalar(
+        select(func.max(Round.created_at)).where(
+            Round.campaign_id == campaign.id, Round.publish_rule != PublishRule.NEVER
+        )
+    )
+    waited = now - (last_start or campaign.created_at)
+    if every_minutes > 0 and new_labels > 0 and waited >= timedelta(minutes=every_minutes):
+        return RoundTrigger.PERIODIC
+    return None
+
+
+def launch_due(session: Session, now: datetime, campaign_id: int) -> Round | None:
+    """Start the round that is due, if one is; two ticks at once start one round."""
+    campaign = session.get(Campaign, campaign_id, with_for_update=True, populate_existing=True)
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    trigger = is_due(session, now, campaign)
+    if trigger is None:
+        return None
+    try:
+        return launch(session, now, campaign_id, RoundRequest(), trigger=trigger)
+    except ConflictError:  # the new labels are all "equal" or "cannot tell"
+        return None
+
+
+def active_campaign_ids(session: Session) -> list[int]:
+    """Campaigns that the tick looks at."""
+    query = select(Campaign.id).where(Campaign.archived.is_(False)).order_by(Campaign.id)
+    return list(session.scalars(query))

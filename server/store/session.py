@@ -1,0 +1,103 @@
+"""The database: SQLite (write-ahead log) or PostgreSQL behind one small class.
+
+The only place that commits. `write()` is one transaction; the jobs that were put in the queue in
+it (`server.store.jobs.enqueue`) are sent after the commit, never before.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy.engine import make_url
+from sqlalchemy.orm import Session, sessionmaker
+
+from server.queue import SendJob
+from server.states import JobKind
+
+logger = logging.getLogger(__name__)
+
+JOBS_TO_SEND = "jobs_to_send"  # key of Session.info: list[tuple[int, JobKind]]
+_BUSY_TIMEOUT_MS = 15_000  # how long a SQLite writer waits for the one before it
+
+
+def make_engine(url: str, *, foreign_keys: bool = True) -> Engine:
+    """Engine for `sqlite:///…` or `postgresql+psycopg://…`.
+
+    `foreign_keys=False` is for migrations on SQLite, which rebuild tables.
+    """
+    parsed = make_url(url)
+    if parsed.get_backend_name() != "sqlite":
+        return create_engine(parsed, pool_size=20, max_overflow=20, pool_pre_ping=True)
+    if parsed.database:
+        Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+    engine = create_engine(parsed, pool_size=20, max_overflow=20)
+
+    @event.listens_for(engine, "connect")
+    def _configure(connection: Any, _record: Any) -> None:
+        connection.isolation_level = None  # the driver must not begin transactions by itself
+        for pragma in (
+            f"busy_timeout={_BUSY_TIMEOUT_MS}",
+            "journal_mode=WAL",
+            "synchronous=NORMAL",
+            f"foreign_keys={'ON' if foreign_keys else 'OFF'}",
+        ):
+            connection.execute(f"PRAGMA {pragma}")
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        # A deferred BEGIN that reads and then writes fails at once with "database is locked" when
+        # another writer came between; IMMEDIATE queues up instead.
+        read_only = connection.get_execution_options().get("read_only", False)
+        connection.exec_driver_sql("BEGIN" if read_only else "BEGIN IMMEDIATE")
+
+    return engine
+
+
+class Database:
+    """Sessions of one database. Make one per process, after any fork."""
+
+    def __init__(self, url: str, send_job: SendJob | None = None) -> None:
+        self.url = url
+        self.engine = make_engine(url)
+        self._send_job = send_job
+        self._write = sessionmaker(self.engine, expire_on_commit=False)
+        reader = self.engine.execution_options(read_only=True)
+        if self.engine.dialect.name == "postgresql":
+            reader = reader.execution_options(postgresql_readonly=True)
+        self._read = sessionmaker(reader, expire_on_commit=False)
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A session for reading; it does not wait for writers and never commits."""
+        with self._read() as session:
+            yield session
+
+    @contextmanager
+    def write(self) -> Iterator[Session]:
+        """One transaction: commit at the end, roll back on any exception, then send its jobs."""
+        with self._write() as session:
+            with session.begin():
+                yield session
+            jobs = session.info.pop(JOBS_TO_SEND, [])
+        self._send(jobs)
+
+    def _send(self, jobs: list[tuple[int, JobKind]]) -> None:
+        """Tell the queue. A broken broker costs time, not work: the beat's tick sends again."""
+        if self._send_job is None:
+            return
+        for index, (job_id, kind) in enumerate(jobs):
+            try:
+                self._send_job(job_id, kind)
+            except OSError:
+                left = [job for job, _ in jobs[index:]]
+                logger.exception("broker away; jobs %s wait for the tick", left)
+                return
+
+    def dispose(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
