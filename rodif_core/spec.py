@@ -103,6 +103,7 @@ class GuideConfig(_JsonConfig):
     batch_size: int = 256
     ema_decay: float = 0.98
     selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
+    require_success: bool = True  # keep only trajectories that the simulation calls successful
     self_training_rounds: int = 0  # extra guide passes on fresh rollouts, without new labels
     self_training_rollouts: int = 150
 

@@ -16,12 +16,12 @@ from rodif_core.tasks.panda import HOME_QPOS, TOOL_BODY, TOOL_SITE, rod_scene
 
 Array = NDArray[np.float64]
 
-DAMPING = 1e-3  # added to the diagonal of J J^T
+DAMPING = 1e-4  # added to the diagonal of J J^T
 POSTURE_GAIN = 0.02  # share of the way home per iteration, in the null space
 MAX_POSITION_ERROR = 0.08  # m per iteration; without these three clamps it diverges from afar
 MAX_ROTATION_ERROR = 0.2  # rad per iteration
 MAX_JOINT_STEP = 0.2  # rad per iteration
-TRACKING_ITERATIONS = 2  # per control step, warm-started: residual below 0.1 mm
+TRACKING_ITERATIONS = 2  # per control step, warm-started: residual below 0.1 mm within reach
 START_ITERATIONS = 60  # from the home posture to any start
 
 # Rod straight down, flange turned by 45 degrees as the real gripper is mounted.
@@ -63,7 +63,9 @@ class RodKinematics:
             joints = np.clip(joints + step, self._low, self._high)
         return joints
 
-    def _step(self, position_error: Array, rotation: Array, jacobian: Array, joints: Array) -> Array:
+    def _step(
+        self, position_error: Array, rotation: Array, jacobian: Array, joints: Array
+    ) -> Array:
         """One damped least-squares step (m, 7) in rad."""
         actual = rotation.reshape(-1, 3, 3)
         # Half the sum of the axes' cross products: the rotation vector for small angles.

@@ -22,11 +22,12 @@ CONTROL_DT = PHYSICS_DT * PHYSICS_STEPS  # 35 ms = 28.57 Hz, as D3IL
 
 # Joint positions (rad) with the rod straight down, in the middle of the table: the posture that
 # redundancy is resolved towards. Joints 6 and 7 of these files are pi/2 and pi/4 off the real arm's.
-HOME_QPOS = (0.0, -0.1, 0.0, -2.25, 0.0, 0.58, 0.0)
+HOME_QPOS = (0.0, 0.223, 0.0, -2.401, 0.0, 1.054, 0.0)
 
 TOOL_BODY = "panda0_link7"
 TOOL_SITE = "rod_tip"  # the end effector of every task with a rod
 ROD_GEOM = "rod"
+CONTACT_SENSOR = "rod_contact"
 ROD_RADIUS = 0.01  # m, as D3IL
 
 TOOL_BIT = 2  # contact bits: rod and table carry 2, objects carry 1 and meet both
@@ -122,6 +123,14 @@ def _add_rod(spec: mujoco.MjSpec) -> None:
         rgba=[0.16, 0.18, 0.22, 1.0],
         contype=TOOL_BIT,
         conaffinity=OBJECT_BIT,
+    )
+    # How many contacts the rod has, found in collision detection, so also without any force.
+    spec.add_sensor(
+        name=CONTACT_SENSOR,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_GEOM,
+        objname=ROD_GEOM,
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
     )
     flange.add_site(name=TOOL_SITE, pos=[0.0, 0.0, 0.30], size=[0.004, 0.0, 0.0], group=4)
 

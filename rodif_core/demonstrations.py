@@ -1,0 +1,178 @@
+"""Scripted demonstrations: many simulations at once, failures drawn again, one file a set."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rodif_core.errors import LearningError, TrajectoryFileError, ValueOutOfRangeError
+from rodif_core.tasks import Task
+from rodif_core.tasks.env import BatchEnv
+from rodif_core.tasks.experts.avoid import TREMBLE, TREMBLE_MEMORY, AvoidExpert
+from rodif_core.trajectory import Trajectory
+
+DEFAULT_LEFT_SHARE = 0.2
+PARALLEL = 100  # simulations stepped together; changes the time, not the result
+MAX_ATTEMPTS = 20  # draws for one demonstration before we say that something is wrong
+
+_FORMAT = 1
+_STEP_ARRAYS = ("observations", "qpos", "paths")  # one row more than actions
+
+
+@dataclass(frozen=True)
+class _Assignment:
+    """One demonstration to make: its place in the set, its mode, and which draw this is."""
+
+    index: int
+    mode: str
+    attempt: int
+
+    def generator(self, seed: int) -> np.random.Generator:
+        return np.random.default_rng([seed, self.index, self.attempt])
+
+
+def make_demonstrations(
+    task: Task,
+    *,
+    episodes: int,
+    seed: int,
+    left_share: float = DEFAULT_LEFT_SHARE,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Trajectory]:
+    """Successful demonstrations in their intended modes, `left_share` of them left.
+
+    Both sides are balanced over their twelve modes. Demonstration i depends on (seed, i) and its
+    mode only, not on how many run together.
+
+    progress  called with (made, episodes) from time to time
+
+    Raises ValueOutOfRangeError for values out of range and LearningError when the expert keeps
+    failing.
+    """
+    if episodes < 1:
+        raise ValueOutOfRangeError("episodes", episodes, "at least 1")
+    if seed < 0:
+        raise ValueOutOfRangeError("seed", seed, "0 or more")
+    if not 0 <= left_share <= 1:
+        raise ValueOutOfRangeError("left_share", left_share, "in [0, 1]")
+    made: dict[int, Trajectory] = {}
+    env = BatchEnv(task, min(PARALLEL, episodes))
+    waiting = [
+        _Assignment(i, mode, 0) for i, mode in enumerate(assign_modes(task, episodes, left_share))
+    ]
+    while waiting:
+        batch, waiting = waiting[:PARALLEL], waiting[PARALLEL:]
+        for assignment, trajectory in zip(batch, _demonstrate(env, batch, seed), strict=True):
+            if trajectory.success and trajectory.outcome["mode"] == assignment.mode:
+                made[assignment.index] = trajectory
+            elif assignment.attempt + 1 == MAX_ATTEMPTS:
+                raise LearningError(
+                    f"the expert failed {MAX_ATTEMPTS} times in mode {assignment.mode}"
+                )
+            else:
+                waiting.append(
+                    _Assignment(assignment.index, assignment.mode, assignment.attempt + 1)
+                )
+        if progress is not None:
+            progress(len(made), episodes)
+    return [made[index] for index in range(episodes)]
+
+
+def assign_modes(task: Task, episodes: int, left_share: float) -> list[str]:
+    """The mode of each demonstration: the sides spread evenly, their modes in turn."""
+    sides = {
+        "left": [mode for mode in task.modes if mode.startswith("L")],
+        "right": [mode for mode in task.modes if mode.startswith("R")],
+    }
+    lefts = np.floor(np.arange(episodes + 1) * left_share + 0.5).astype(int)
+    modes = []
+    for index in range(episodes):
+        left = lefts[index + 1] > lefts[index]
+        turn = lefts[index] if left else index - lefts[index]
+        choices = sides["left" if left else "right"]
+        modes.append(choices[turn % len(choices)])
+    return modes
+
+
+def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list[Trajectory]:
+    """One trajectory an assignment, successful or not."""
+    task = env.task
+    generators = [assignment.generator(seed) for assignment in batch]
+    contexts = [task.sample_context(rng) for rng in generators]
+    experts = [
+        AvoidExpert.draw(assignment.mode, tuple(context["start"]), rng)
+        for assignment, context, rng in zip(batch, contexts, generators, strict=True)
+    ]
+    observations = [env.reset(contexts)]
+    qpos, paths, actions = [env.qpos], [env.paths], []
+    tremble = np.zeros((len(batch), task.action_dim))
+    fresh = TREMBLE * np.sqrt(1 - TREMBLE_MEMORY**2)  # keeps the standard deviation at TREMBLE
+    while not env.done.all():
+        action = np.zeros((len(batch), task.action_dim), dtype=np.float32)
+        for i in np.flatnonzero(~env.done):
+            kick = generators[i].normal(0.0, fresh, task.action_dim)
+            tremble[i] = TREMBLE_MEMORY * tremble[i] + kick
+            wanted = experts[i].act(observations[-1][i]) + tremble[i]
+            action[i] = np.clip(wanted, -task.action_limit, task.action_limit)
+        actions.append(action)
+        observations.append(env.step(action))
+        qpos.append(env.qpos)
+        paths.append(env.paths)
+    columns = [np.stack(rows) for rows in (observations, actions, qpos, paths)]
+    outcomes, steps = env.outcomes(), env.steps
+    return [
+        _trajectory(
+            task,
+            columns=[column[:, i] for column in columns],
+            length=int(steps[i]),
+            context=contexts[i],
+            outcome=outcomes[i],
+            info={
+                "seed": seed,
+                "index": batch[i].index,
+                "attempt": batch[i].attempt,
+                "expert": experts[i].to_json(),
+            },
+        )
+        for i in range(len(batch))
+    ]
+
+
+def _trajectory(
+    task: Task,
+    columns: Sequence[NDArray[np.float32]],
+    length: int,
+    context: dict[str, Any],
+    outcome: dict[str, Any],
+    info: dict[str, Any],
+) -> Trajectory:
+    """Cut one episode of `length` control steps out of its columns; it has no decisions."""
+    observations, actions, qpos, paths = columns
+    return Trajectory(
+        observations=observations[: length + 1].copy(),
+        actions=actions[:length].copy(),
+        qpos=qpos[: length + 1].copy(),
+        paths=paths[: length + 1].copy(),
+        histories=np.zeros((0, 1, task.observation_dim), np.float32),
+        chains=np.zeros((0, 1, 1, task.action_dim), np.float32),
+        decision_steps=np.zeros(0, np.int32),
+        context=context,
+        outcome=outcome,
+        info={
+            "task": task.name.value,
+            "mode": outcome["mode"],
+            "control_dt": task.control_dt,
+            "mujoco_version": mujoco.__version__,
+            **info,
+        },
+    )

@@ -1,0 +1,102 @@
+"""Fine-tuning: a checkpoint, trajectories and preferences in; a candidate checkpoint out.
+
+`rodif` and `dp_dpo` minimise the paper's losses (`contrast`); `rodif_guided`, the default, scores
+the trajectories with RoDiF and then guides (`guided`). Same labels, same door. Deterministic on a
+CPU: equal arguments give equal weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rodif_core.contrast import Progress, contrast
+from rodif_core.errors import LearningError
+from rodif_core.guided import finetune_guided
+from rodif_core.log_ratio import PairMatrix, Transitions, kl_per_trajectory
+from rodif_core.policies.checkpoint import Checkpoint
+from rodif_core.policies.policy import DiffusionPolicy
+from rodif_core.preferences.pairs import Preference
+from rodif_core.spec import FinetuneConfig, FinetuneMethod
+from rodif_core.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class FinetuneResult:
+    """The candidate and what the round stores about its making (JSON types).
+
+    report: method, stopped, curve, kl_winners and kl_losers (nats per decision on the stored
+    states of trajectories that win or lose most of their labels), pairs, trajectories, and for
+    `rodif_guided` scores, trials and the chosen scale.
+    """
+
+    checkpoint: Checkpoint
+    report: dict[str, Any]
+
+
+def finetune(
+    checkpoint: Checkpoint,
+    trajectories: Sequence[Trajectory],
+    preferences: Sequence[Preference],
+    config: FinetuneConfig,
+    *,
+    workspace: Path | None = None,
+    progress: Progress | None = None,
+) -> FinetuneResult:
+    """Steer the policy towards the preferred trajectories; the given checkpoint is the reference.
+
+    preferences index into trajectories. `workspace` keeps partial state, so that a second call
+    with the same arguments goes on where the first was killed. Raises LearningError without
+    usable labels or when conservativeness is not set (estimate it from the labels first).
+    """
+    if config.conservativeness is None and config.method is not FinetuneMethod.DP_DPO:
+        raise LearningError("conservativeness is not set: estimate it from the labels first")
+    for preference in preferences:
+        if not all(0 <= i < len(trajectories) for i in (preference.winner, preference.loser)):
+            raise LearningError(
+                f"preference {preference} names a trajectory outside 0 … {len(trajectories) - 1}"
+            )
+    transitions = Transitions.collect(checkpoint.policy, trajectories, config.chunk_rows)
+    report: dict[str, Any] = {
+        "method": config.method.value,
+        "pairs": len(preferences),
+        "trajectories": len(trajectories),
+        "decisions": len(transitions.chains),
+    }
+    if config.method is FinetuneMethod.RODIF_GUIDED:
+        policy, details = finetune_guided(
+            checkpoint, trajectories, preferences, transitions, config,
+            workspace=workspace, progress=progress,
+        )  # fmt: skip
+        report |= details
+    else:
+        matrix = PairMatrix.build(transitions, preferences, config)
+        result = contrast(
+            checkpoint.policy, transitions, matrix, config,
+            stage=config.method.value, workspace=workspace, progress=progress,
+        )  # fmt: skip
+        policy = result.policy
+        report |= {"curve": result.curve, "stopped": result.stopped}
+    report |= _drift(policy, transitions, preferences, config)
+    card = {"kind": "finetuned", "parent": checkpoint.digest, "config": config.to_json()}
+    return FinetuneResult(replace(checkpoint, policy=policy, card=card), report)
+
+
+def _drift(
+    policy: DiffusionPolicy,
+    transitions: Transitions,
+    preferences: Sequence[Preference],
+    config: FinetuneConfig,
+) -> dict[str, float]:
+    """KL to the reference on stored states: a diagnosis, not a measure of support."""
+    kl = np.asarray(kl_per_trajectory(policy, transitions, config.chunk_rows))
+    balance = np.zeros(len(kl))
+    for preference in preferences:
+        balance[preference.winner] += 1
+        balance[preference.loser] -= 1
+    means = {"kl_winners": kl[balance > 0], "kl_losers": kl[balance < 0]}
+    return {name: float(rows.mean()) if len(rows) else 0.0 for name, rows in means.items()}

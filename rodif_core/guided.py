@@ -1,0 +1,249 @@
+"""`rodif_guided`: RoDiF as a label denoiser, then guidance, then a choice by fresh rollouts.
+
+Nothing here knows the true criterion: the choice among guidance scales looks at success and
+drift, which the simulation knows, and at the utility that the labels themselves predict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rodif_core.contrast import Progress, contrast
+from rodif_core.drift import off_support_share
+from rodif_core.errors import LearningError
+from rodif_core.gate import OFF_SUPPORT_RATIO, OFF_SUPPORT_SLACK
+from rodif_core.guidance import guide
+from rodif_core.log_ratio import (
+    PairMatrix,
+    Transitions,
+    compute_ratios,
+    mean_ratio_per_trajectory,
+)
+from rodif_core.policies.checkpoint import Checkpoint
+from rodif_core.policies.policy import DiffusionPolicy
+from rodif_core.preferences.pairs import Preference
+from rodif_core.rollout import rollout
+from rodif_core.scoring import PathUtility, path_features, split_threshold, standardise
+from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Scorer
+from rodif_core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+SELECTION_SEED = 7_000_000  # rollouts that choose a scale never share a seed with an evaluation
+SUCCESS_SLACK = 0.03  # a scale may lose this much success against the parent on the same seeds
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Utilities of the labelled trajectories, both opinions, and who is kept as a winner."""
+
+    network: Array
+    gaussian_process: Array
+    used: Array
+    threshold: float
+    kept: list[int]
+    path_utility: PathUtility
+    path_threshold: float
+
+    def to_json(self) -> dict[str, Any]:
+        """What the round stores; agreement = share of trajectories both place on one side."""
+        network_side = self.network > split_threshold(self.network)
+        path_side = self.gaussian_process > self.path_threshold
+        return {
+            "network": [round(float(value), 4) for value in self.network],
+            "gaussian_process": [round(float(value), 4) for value in self.gaussian_process],
+            "agreement": float((network_side == path_side).mean()),
+            "kept": self.kept,
+            "trajectories": len(self.used),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One guidance scale and what its fresh rollouts show."""
+
+    scale: float
+    policy: DiffusionPolicy
+    success: float
+    off_support: float
+    predicted: float  # share of rollouts that succeed and that the labels predict to be preferred
+
+    def to_json(self) -> dict[str, float]:
+        """Plain JSON types."""
+        return {
+            "scale": self.scale,
+            "success": self.success,
+            "off_support": self.off_support,
+            "predicted_preferred": self.predicted,
+        }
+
+
+def finetune_guided(
+    checkpoint: Checkpoint,
+    trajectories: Sequence[Trajectory],
+    preferences: Sequence[Preference],
+    transitions: Transitions,
+    config: FinetuneConfig,
+    *,
+    workspace: Path | None,
+    progress: Progress | None,
+) -> tuple[DiffusionPolicy, dict[str, Any]]:
+    """Score, guide at every scale, choose; optional self-training. Returns policy and report."""
+    matrix = PairMatrix.build(transitions, preferences, config)
+    scores = score(
+        checkpoint, trajectories, preferences, transitions, matrix, config, workspace, progress
+    )
+    histories, chunks = _kept_decisions(transitions, scores.kept)
+    base = _try(checkpoint, checkpoint.policy, 0.0, scores, config, 0)
+    trials = []
+    for index, scale in enumerate(config.guide.scales):
+        policy = guide(
+            checkpoint.policy, histories, chunks, scale, config.guide, config.seed,
+            _stage(progress, f"guide s={scale:g}"),
+        )  # fmt: skip
+        trials.append(_try(checkpoint, policy, scale, scores, config, 0))
+        if progress is not None:
+            metrics = {k: v for k, v in trials[-1].to_json().items() if k != "scale"}
+            progress("choose", (index + 1) / len(config.guide.scales), metrics)
+    chosen = choose(base, trials)
+    report: dict[str, Any] = {
+        "scores": scores.to_json(),
+        "base": base.to_json(),
+        "trials": [trial.to_json() for trial in trials],
+        "chosen_scale": chosen.scale,
+        "self_training": [],
+    }
+    for extra in range(config.guide.self_training_rounds):
+        chosen = _self_train(checkpoint, chosen, scores, histories, chunks, config, extra, progress)
+        report["self_training"].append(chosen.to_json())
+    return chosen.policy, report
+
+
+def score(
+    checkpoint: Checkpoint,
+    trajectories: Sequence[Trajectory],
+    preferences: Sequence[Preference],
+    transitions: Transitions,
+    matrix: PairMatrix,
+    config: FinetuneConfig,
+    workspace: Path | None = None,
+    progress: Progress | None = None,
+) -> Scores:
+    """Utilities from both models; winners lie above the cut of the configured one."""
+    scorer = replace(config, method=FinetuneMethod.RODIF, updates=config.guide.score_updates)
+    moved = contrast(
+        checkpoint.policy, transitions, matrix, scorer,
+        stage="score", workspace=workspace, progress=progress,
+    )  # fmt: skip
+    ratios = compute_ratios(moved.policy, transitions, config)
+    network = np.asarray(mean_ratio_per_trajectory(ratios, transitions))
+    path_utility = PathUtility.fit(path_features(trajectories), preferences)
+    opinions = {
+        Scorer.NETWORK: standardise(network),
+        Scorer.GAUSSIAN_PROCESS: standardise(path_utility.utilities),
+        Scorer.COMBINED: standardise(network) + standardise(path_utility.utilities),
+    }
+    used = opinions[config.guide.scorer]
+    threshold = split_threshold(used)
+    kept = [i for i in range(len(used)) if used[i] > threshold]
+    if config.guide.require_success:
+        kept = [i for i in kept if trajectories[i].success]
+    if not kept:
+        raise LearningError("no successful trajectory scores above the cut; more labels are needed")
+    return Scores(
+        network,
+        path_utility.utilities,
+        used,
+        threshold,
+        kept,
+        path_utility,
+        split_threshold(path_utility.utilities),
+    )
+
+
+def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
+    """The scale whose rollouts the labels like best, among those that keep success and support.
+
+    When none keeps both, the one that leaves the data least. Ties go to the smaller scale.
+    """
+    limit = OFF_SUPPORT_RATIO * base.off_support + OFF_SUPPORT_SLACK / 2
+    sound = [
+        trial
+        for trial in trials
+        if trial.success >= base.success - SUCCESS_SLACK and trial.off_support <= limit
+    ]
+    if sound:
+        return max(sound, key=lambda trial: (trial.predicted, -trial.scale))
+    return min(trials, key=lambda trial: (trial.off_support - trial.success, trial.scale))
+
+
+def _kept_decisions(transitions: Transitions, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
+    rows = torch.tensor([row for i in kept for row in transitions.steps_of(i)])
+    return transitions.histories[rows], transitions.chains[rows, -1]
+
+
+def _try(
+    checkpoint: Checkpoint,
+    policy: DiffusionPolicy,
+    scale: float,
+    scores: Scores,
+    config: FinetuneConfig,
+    block: int,
+) -> Trial:
+    """Fresh rollouts of a policy; every trial of a block uses the same seeds."""
+    rollouts = _fresh(checkpoint, policy, config.guide.selection_rollouts, config, block)
+    liked = _liked(rollouts, scores)
+    off = off_support_share(rollouts, checkpoint.policy.normaliser, checkpoint.support)
+    success = float(np.mean([trajectory.success for trajectory in rollouts]))
+    return Trial(scale, policy, success, off, float(liked.mean()))
+
+
+def _fresh(
+    checkpoint: Checkpoint, policy: DiffusionPolicy, count: int, config: FinetuneConfig, block: int
+) -> list[Trajectory]:
+    seed = SELECTION_SEED + 10_000 * config.seed + 1_000 * block
+    return rollout(replace(checkpoint, policy=policy), RolloutConfig(count, seed))
+
+
+def _liked(rollouts: Sequence[Trajectory], scores: Scores) -> NDArray[np.bool_]:
+    predicted = scores.path_utility.predict(path_features(rollouts)) > scores.path_threshold
+    liked: NDArray[np.bool_] = predicted & np.asarray([t.success for t in rollouts])
+    return liked
+
+
+def _self_train(
+    checkpoint: Checkpoint,
+    current: Trial,
+    scores: Scores,
+    histories: Tensor,
+    chunks: Tensor,
+    config: FinetuneConfig,
+    extra: int,
+    progress: Progress | None,
+) -> Trial:
+    """Roll out, keep what succeeds and is predicted to be liked, guide again from the present."""
+    count = config.guide.self_training_rollouts
+    rollouts = _fresh(checkpoint, current.policy, count, config, 2 * extra + 1)
+    good = [t for t, ok in zip(rollouts, _liked(rollouts, scores), strict=True) if ok]
+    if good:
+        fresh = Transitions.collect(current.policy, good, config.chunk_rows)
+        histories = torch.cat([histories, fresh.histories])
+        chunks = torch.cat([chunks, fresh.chains[:, -1]])
+    policy = guide(
+        current.policy, histories, chunks, current.scale, config.guide,
+        config.seed + extra + 1, _stage(progress, f"self-training {extra + 1}"),
+    )  # fmt: skip
+    return _try(checkpoint, policy, current.scale, scores, config, 2 * extra + 2)
+
+
+def _stage(progress: Progress | None, name: str) -> Any:
+    if progress is None:
+        return None
+    return lambda done, of, metrics: progress(name, done / of, metrics)

@@ -1,0 +1,191 @@
+"""Log-ratios of whole label sets: every transition once per update, exact full-batch gradients.
+
+Legend: N transitions (all decision steps of all trajectories), M pairs, T compared steps,
+K denoising steps, To observation history, Tp predicted chunk, O observation dims, A action dims.
+
+Reference means are computed once and cached. An update takes two passes in bounded memory: the
+first gives the log-ratio of every transition without a graph, from which the loss yields one
+weight dL/d(log-ratio) per transition; the second runs the network in chunks and back-propagates
+weight · log-ratio. The gradients add up to the full-batch gradient exactly (chain rule).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rodif_core.diffusion.chain import chain_kl, chain_means, log_prob_ratio
+from rodif_core.errors import LearningError
+from rodif_core.losses import LossOutput, compute_delta_q, dp_dpo_loss, rodif_loss
+from rodif_core.policies.policy import DiffusionPolicy
+from rodif_core.preferences.pairs import Preference
+from rodif_core.spec import FinetuneConfig, FinetuneMethod, StepPairing
+from rodif_core.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """Decision steps of all trajectories, one after the other.
+
+    histories (N, To, O) and chains (N, K + 1, Tp, A) normalised; ref_means (N, S, Tp, A) of the
+    reference policy for S scored steps; starts (trajectories + 1,): trajectory i owns the rows
+    starts[i] … starts[i + 1] - 1.
+    """
+
+    histories: Tensor
+    chains: Tensor
+    ref_means: Tensor
+    starts: tuple[int, ...]
+
+    @classmethod
+    def collect(
+        cls, reference: DiffusionPolicy, trajectories: Sequence[Trajectory], chunk_rows: int
+    ) -> Transitions:
+        """Stack the trajectories and cache the reference means."""
+        if not trajectories or any(len(t.decision_steps) == 0 for t in trajectories):
+            raise LearningError("fine-tuning needs trajectories with denoising chains, got none")
+        histories = np.concatenate([trajectory.histories for trajectory in trajectories])
+        chains = torch.from_numpy(np.concatenate([t.chains for t in trajectories]))
+        normalised = reference.normaliser.observation(torch.from_numpy(histories))
+        counts = [len(trajectory.decision_steps) for trajectory in trajectories]
+        starts = (0, *np.cumsum(counts).tolist())
+        with torch.no_grad():
+            parts = [
+                chain_means(reference.denoiser, reference.schedule, normalised[a:b], chains[a:b])
+                for a, b in _chunks(len(chains), reference, chunk_rows)
+            ]
+        return cls(normalised, chains, torch.cat(parts), starts)
+
+    def steps_of(self, trajectory: int) -> range:
+        """Rows of one trajectory."""
+        return range(self.starts[trajectory], self.starts[trajectory + 1])
+
+
+@dataclass(frozen=True, eq=False)
+class PairMatrix:
+    """Which transitions are compared: winners, losers (M, T) int64 rows; weights (M, T) ≥ 0."""
+
+    winners: Tensor
+    losers: Tensor
+    weights: Tensor
+
+    @classmethod
+    def build(
+        cls,
+        transitions: Transitions,
+        preferences: Sequence[Preference],
+        config: FinetuneConfig,
+    ) -> PairMatrix:
+        """Step t of the winner against step t of the loser, over min(T_w, T_l) steps.
+
+        `same_index` weighs every step 1 (the paper); `matched_state` weighs a step by
+        exp(-d² / 2h²) of the distance d between the two states (normalised observations).
+        """
+        if not preferences:
+            raise LearningError("no label prefers one trajectory over another; label some pairs")
+        rows = [
+            (transitions.steps_of(p.winner), transitions.steps_of(p.loser)) for p in preferences
+        ]
+        longest = max(min(len(w), len(l)) for w, l in rows)  # noqa: E741
+        winners = torch.zeros(len(rows), longest, dtype=torch.int64)
+        losers, weights = winners.clone(), torch.zeros(len(rows), longest)
+        for i, (winner, loser) in enumerate(rows):
+            count = min(len(winner), len(loser))
+            winners[i, :count] = torch.tensor(winner[:count])
+            losers[i, :count] = torch.tensor(loser[:count])
+            weights[i, :count] = 1.0
+        if config.step_pairing is StepPairing.MATCHED_STATE:
+            states = transitions.histories[:, -1]
+            distance = (states[winners] - states[losers]).norm(dim=-1)
+            weights = weights * torch.exp(-0.5 * (distance / config.matched_state_scale) ** 2)
+        return cls(winners, losers, weights)
+
+
+def compute_ratios(
+    policy: DiffusionPolicy, transitions: Transitions, config: FinetuneConfig
+) -> Tensor:
+    """log π_θ - log π_ref of every transition, without a graph → (N,)."""
+    with torch.no_grad():
+        return torch.cat(
+            [
+                _ratio_chunk(policy, transitions, a, b, config)
+                for a, b in _chunks(len(transitions.chains), policy, config.chunk_rows)
+            ]
+        )
+
+
+def mean_ratio_per_trajectory(ratios: Tensor, transitions: Transitions) -> list[float]:
+    """Mean log-ratio of each trajectory's decision steps: RoDiF's opinion of the trajectory."""
+    starts = transitions.starts
+    return [float(ratios[a:b].mean()) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+
+
+def kl_per_trajectory(
+    policy: DiffusionPolicy, transitions: Transitions, chunk_rows: int
+) -> list[float]:
+    """Mean KL to the reference per decision along each stored trajectory, in nats."""
+    with torch.no_grad():
+        parts = []
+        for a, b in _chunks(len(transitions.chains), policy, chunk_rows):
+            means = chain_means(
+                policy.denoiser, policy.schedule, transitions.histories[a:b],
+                transitions.chains[a:b],
+            )  # fmt: skip
+            parts.append(chain_kl(policy.schedule, means, transitions.ref_means[a:b]))
+    return mean_ratio_per_trajectory(torch.cat(parts), transitions)
+
+
+def preference_loss(ratios: Tensor, matrix: PairMatrix, config: FinetuneConfig) -> LossOutput:
+    """The configured loss as a function of all log-ratios (N,)."""
+    delta_q = compute_delta_q(ratios, matrix.winners, matrix.losers, config.kl_coef)
+    if config.method is FinetuneMethod.DP_DPO:
+        return dp_dpo_loss(delta_q, matrix.weights, vote_temperature=config.vote_temperature)
+    if config.conservativeness is None:
+        raise LearningError("conservativeness is not set: estimate it from the labels first")
+    return rodif_loss(
+        delta_q,
+        matrix.weights,
+        conservativeness=config.conservativeness,
+        vote_temperature=config.vote_temperature,
+        outer_temperature=config.outer_temperature,
+        vote_scale=config.vote_scale,
+        reduction=config.reduction,
+        group_size=config.group_size,
+    )
+
+
+def accumulate_gradient(
+    policy: DiffusionPolicy,
+    transitions: Transitions,
+    config: FinetuneConfig,
+    loss_of_ratios: Callable[[Tensor], LossOutput],
+) -> LossOutput:
+    """Add the exact full-batch gradient to the parameters' `.grad`; returns the loss."""
+    ratios = compute_ratios(policy, transitions, config).requires_grad_()
+    output = loss_of_ratios(ratios)
+    (weights,) = torch.autograd.grad(output.loss, ratios)
+    for a, b in _chunks(len(transitions.chains), policy, config.chunk_rows):
+        part = _ratio_chunk(policy, transitions, a, b, config)
+        (weights[a:b] * part).sum().backward()
+    return LossOutput(output.loss.detach(), output.metrics)
+
+
+def _ratio_chunk(
+    policy: DiffusionPolicy, transitions: Transitions, a: int, b: int, config: FinetuneConfig
+) -> Tensor:
+    size = policy.config
+    steps = size.executed_steps if config.executed_only else size.predicted_steps
+    chain = transitions.chains[a:b]
+    means = chain_means(policy.denoiser, policy.schedule, transitions.histories[a:b], chain)
+    return log_prob_ratio(policy.schedule, chain, means, transitions.ref_means[a:b], steps)
+
+
+def _chunks(count: int, policy: DiffusionPolicy, rows: int) -> list[tuple[int, int]]:
+    """Boundaries of network calls of about `rows` rows; the same for reference and candidate,
+    so that equal weights give bit-equal means and log-ratios of exactly 0."""
+    size = max(1, rows // len(policy.schedule.scored_steps))
+    return [(a, min(a + size, count)) for a in range(0, count, size)]

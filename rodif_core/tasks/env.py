@@ -1,0 +1,189 @@
+"""Stepping many simulations of one task together.
+
+Every simulation gives the same bits whatever its neighbours, their number and the number of
+threads. A finished simulation is frozen: it keeps its last values and costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from numpy.typing import NDArray
+
+from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.tasks.base import (
+    COLLISION,
+    DIVERGED,
+    FINISHED,
+    LEFT_WORKSPACE,
+    TIME_LIMIT,
+    Context,
+    Task,
+)
+from rodif_core.tasks.control import RodKinematics
+from rodif_core.tasks.panda import CONTACT_SENSOR, PHYSICS_STEPS, TOOL_SITE
+
+
+class BatchEnv:
+    """Up to `n` simulations of a task, stepped together on `threads` threads.
+
+    Legend: A action dims, O observation dims, Q position dims of the physics. All arrays that are
+    handed out are copies.
+    """
+
+    def __init__(self, task: Task, n: int, threads: int = 1) -> None:
+        if n < 1:
+            raise ValueOutOfRangeError("n", n, "at least 1 simulation")
+        if threads < 1:
+            raise ValueOutOfRangeError("threads", threads, "at least 1")
+        self.task = task
+        self.n = n
+        model = task.build_model("col")
+        self._kinematics = RodKinematics(n, threads)
+        self._batch = mujoco.batch.Batch(model, n, threads)
+        self._qpos = self._batch.bind("qpos")
+        self._ctrl = self._batch.bind("ctrl")
+        self._tip = self._batch.bind("site_xpos")[:, model.site(TOOL_SITE).id]
+        self._sensors = self._batch.bind("sensordata")
+        self._contact = int(model.sensor(CONTACT_SENSOR).adr[0])
+        self._setpoints = np.zeros((n, 3))
+        self._ends = np.zeros((n, 3))
+        self._history = np.zeros((task.max_steps + 1, n, 3))
+        self._steps = np.zeros(n, dtype=np.int64)
+        self._reasons: list[str | None] = [None] * n
+        self._episodes = 0
+        self._done = np.ones(n, dtype=bool)
+
+    def reset(self, contexts: Sequence[Context]) -> NDArray[np.float32]:
+        """Start one episode a context; returns the first observations (len(contexts), O) float32.
+
+        With fewer contexts than n, the other simulations stay out: all arrays of this object then
+        have len(contexts) rows. Raises ValueOutOfRangeError for a bad context.
+        """
+        count = len(contexts)
+        if not 1 <= count <= self.n:
+            raise ValueOutOfRangeError("number of contexts", count, f"1 … {self.n}")
+        starts = np.stack([self.task.start_point(context) for context in contexts])
+        ids = np.arange(count)
+        joints = self._kinematics.start(starts)
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._qpos[ids] = joints
+        self._ctrl[ids] = joints
+        self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
+        self._episodes = count
+        self._setpoints = starts
+        self._ends = self._tip[ids]
+        self._history[0, :count] = self._ends
+        self._steps = np.zeros(count, dtype=np.int64)
+        self._reasons = [None] * count
+        self._done = np.zeros(count, dtype=bool)
+        return self._observations()
+
+    def step(
+        self, actions: NDArray[np.floating[Any]], active: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float32]:
+        """One control step (35 ms) with actions (m, A), clipped to +- action_limit.
+
+        active  (m,) bool: which simulations move; the others, and finished ones, stay as they are.
+
+        Returns observations (m, O) float32. A simulation with a non-finite action or state is
+        ended with reason "diverged"; the others go on.
+        """
+        actions = np.asarray(actions, dtype=np.float64)
+        shape = (self._episodes, self.task.action_dim)
+        if actions.shape != shape:
+            raise ValueOutOfRangeError("shape of actions", actions.shape, f"{shape}")
+        moving = ~self._done if active is None else ~self._done & np.asarray(active, dtype=bool)
+        finite = np.isfinite(actions).all(axis=1)
+        self._end(np.flatnonzero(moving & ~finite), DIVERGED)
+        ids = np.flatnonzero(moving & finite)
+        if len(ids):
+            self._advance(ids, actions[ids])
+        return self._observations()
+
+    def _advance(self, ids: NDArray[np.int64], actions: NDArray[np.float64]) -> None:
+        """Move the simulations `ids` by one control step and see whether they end."""
+        limit = self.task.action_limit
+        setpoints = self.task.move(self._setpoints[ids], np.clip(actions, -limit, limit))
+        self._ctrl[ids] = self._kinematics.solve(setpoints, self._ctrl[ids])
+        touched, failed = self._physics(ids)
+        ends = self._tip[ids]
+        failed |= ~np.isfinite(ends).all(axis=1) | ~np.isfinite(self._qpos[ids]).all(axis=1)
+        self._end(ids[failed], DIVERGED)
+        good = ~failed
+        ids, ends, touched = ids[good], ends[good], touched[good]
+        self._setpoints[ids] = setpoints[good]
+        self._ends[ids] = ends
+        self._steps[ids] += 1
+        self._history[self._steps[ids], ids] = ends
+        # The first reason that holds counts: contact comes before everything else.
+        self._end(ids[touched], COLLISION)
+        self._end(ids[self.task.finished(ends)], FINISHED)
+        self._end(ids[~self.task.inside(ends)], LEFT_WORKSPACE)
+        self._end(ids[self._steps[ids] >= self.task.max_steps], TIME_LIMIT)
+
+    def _physics(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """All physics steps of one control step; returns (touched, failed) of each simulation.
+
+        A step's sensors describe the state before it, hence the look at the last state; that of
+        the state before the first step is the previous control step's last.
+        """
+        self._batch.warning[ids] = 0
+        record = np.zeros((len(ids), PHYSICS_STEPS, self._sensors.shape[1]))
+        failed = np.zeros(len(ids), dtype=bool)
+        try:
+            out = {"sensordata": record}
+            self._batch.rollout(PHYSICS_STEPS, record=("sensordata",), ids=ids, out=out)
+        except mujoco.batch.SimulationError as error:
+            failed |= np.isin(ids, error.ids)
+        failed |= self._batch.warning[ids].reshape(len(ids), -1).any(axis=1)
+        if not failed.all():
+            self._batch.forward(ids[~failed], stage=mujoco.mjtStage.mjSTAGE_POS)
+        touched = (record[:, :, self._contact] > 0).any(axis=1)
+        touched |= self._sensors[ids, self._contact] > 0
+        return touched, failed
+
+    def _end(self, ids: NDArray[np.int64], reason: str) -> None:
+        for index in ids:
+            if not self._done[index]:
+                self._done[index] = True
+                self._reasons[index] = reason
+
+    def _observations(self) -> NDArray[np.float32]:
+        return self.task.observe(self._setpoints, self._ends).astype(np.float32)
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """(m,) bool: which episodes have ended."""
+        return self._done.copy()
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(m,) control steps done so far."""
+        return self._steps.copy()
+
+    @property
+    def qpos(self) -> NDArray[np.float32]:
+        """(m, Q) float32 positions of the physics."""
+        return self._qpos[: self._episodes].astype(np.float32)
+
+    @property
+    def paths(self) -> NDArray[np.float32]:
+        """(m, 3) float32 end-effector positions in metres; the rows of a trajectory's `paths`."""
+        return self._ends.astype(np.float32)
+
+    def outcomes(self) -> list[dict[str, Any]]:
+        """One outcome an episode; see `Task.outcome`. Raises ValueError before all have ended."""
+        outcomes = []
+        for index, reason in enumerate(self._reasons):
+            if reason is None:
+                raise ValueError(
+                    f"episode {index} has not ended; step until `done` is true for all"
+                )
+            path = self._history[: self._steps[index] + 1, index]
+            outcomes.append(self.task.outcome(path, reason))
+        return outcomes

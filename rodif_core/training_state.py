@@ -1,0 +1,58 @@
+"""Partial state of a training loop on disk, so that a killed run goes on where it was.
+
+One safetensors file (parameters, averages, Adam moments) with a JSON header; written to a
+temporary file and renamed, so a kill in the middle leaves the older state.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import safe_open
+from torch import Tensor, nn
+
+
+def save_state(
+    path: Path, modules: dict[str, nn.Module], optimizer: torch.optim.Optimizer, facts: Any
+) -> None:
+    """Write the weights of all modules, the optimizer's moments and JSON facts."""
+    tensors: dict[str, Tensor] = {}
+    for label, module in modules.items():
+        for name, value in module.state_dict().items():
+            tensors[f"{label}/{name}"] = value.detach().cpu().clone()
+    for index, moments in optimizer.state_dict()["state"].items():
+        for name, value in moments.items():
+            tensors[f"optimizer/{index}/{name}"] = torch.as_tensor(value).detach().cpu().clone()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".partial")
+    safetensors.torch.save_file(tensors, temporary, metadata={"facts": json.dumps(facts)})
+    os.replace(temporary, path)
+
+
+def load_state(
+    path: Path, modules: dict[str, nn.Module], optimizer: torch.optim.Optimizer
+) -> Any | None:
+    """Restore what `save_state` wrote and return its facts; None when there is no such file."""
+    if not path.exists():
+        return None
+    with safe_open(str(path), framework="pt") as file:
+        facts = json.loads(file.metadata()["facts"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    for label, module in modules.items():
+        prefix = f"{label}/"
+        module.load_state_dict(
+            {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+        )
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimizer/"):
+            _, index, key = name.split("/")
+            state.setdefault(int(index), {})[key] = value
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": state, "param_groups": groups})
+    return facts
