@@ -1,0 +1,1 @@
+"""The command line `rodif`: one module a command, each with `add_parser` and `run`."""

@@ -1,0 +1,49 @@
+"""`rodif`: the command line. Heavy imports happen inside the commands, so that help is quick."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rodif_core.errors import RodifError
+from worker.cli import bench, demo, doctor, evaluate, pretrain, round, simulate, up
+
+COMMANDS = {
+    "up": up,
+    "demo": demo,
+    "simulate": simulate,
+    "round": round,
+    "evaluate": evaluate,
+    "pretrain": pretrain,
+    "bench": bench,
+    "doctor": doctor,
+}
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands with their options."""
+    parser = argparse.ArgumentParser(
+        prog="rodif",
+        description="Steer a diffusion policy by looking at its behaviour and clicking.",
+    )
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in COMMANDS.values():
+        module.add_parser(subparsers)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; 0 when it did what was asked, 1 on an error, 130 on Ctrl-C."""
+    args = build_parser().parse_args(arguments)
+    try:
+        return COMMANDS[args.command].run(args)
+    except RodifError as error:
+        print(f"rodif {args.command}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

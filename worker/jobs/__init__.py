@@ -1,0 +1,1 @@
+"""One module a kind of job, each with `run(attempt)`. They import torch, mujoco and viser."""

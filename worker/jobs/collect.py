@@ -1,0 +1,182 @@
+"""Roll out a checkpoint, store the episodes, choose pairs, ask for their replays.
+
+Episode i of a collect job has seed `seed + i`, and (campaign, checkpoint, seed) is unique: a
+second attempt rolls out only the seeds that are missing, and two attempts store the same rows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from rodif_core.evaluate import thin_path
+from rodif_core.policies.checkpoint import Checkpoint as Policy
+from rodif_core.policies.checkpoint import load_checkpoint
+from rodif_core.preferences.pairs import choose_pairs
+from rodif_core.rollout import rollout
+from rodif_core.spec import RolloutConfig
+from rodif_core.trajectory import Trajectory
+from server.states import JobKind, PairState
+from server.store import jobs
+from server.store.tables import Checkpoint, Episode, Pair
+from worker.attempt import Attempt
+
+BATCH = 20  # episodes per transaction: what at most is lost when the worker dies
+PAIR_STREAM, SIDE_STREAM = 2, 3  # random streams of a job beside those of its rollouts
+
+
+@dataclass(frozen=True)
+class CollectPlan:
+    """The payload of a collect job."""
+
+    episodes: int
+    seed: int
+    checkpoint_id: int
+    pairs: int
+    strategy: str
+    random_share: float
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the job's episodes."""
+        return range(self.seed, self.seed + self.episodes)
+
+
+def run(attempt: Attempt) -> None:
+    """Do the job, or what is left of it."""
+    plan = CollectPlan(**attempt.facts.payload)
+    with attempt.bench.database.read() as session:
+        checkpoint = session.get_one(Checkpoint, plan.checkpoint_id)
+        stored = {episode.seed for episode in _episodes(session, attempt, plan)}
+    policy = load_checkpoint(attempt.bench.artifacts.get(checkpoint.artifact_sha256))
+    attempt.progress("rollouts", len(stored) / plan.episodes)
+    for seeds in _batches([seed for seed in plan.seeds if seed not in stored]):
+        _store(attempt, plan, policy, seeds)
+        stored.update(seeds)
+        attempt.progress("rollouts", len(stored) / plan.episodes)
+    with attempt.step() as session:
+        episodes = _episodes(session, attempt, plan)
+        pairs = _add_pairs(session, attempt, plan, episodes)
+        groups = Counter(episode.group or "none" for episode in episodes)
+        attempt.finish(
+            session,
+            {
+                "episodes": len(episodes),
+                "pairs": pairs,
+                "groups": dict(sorted(groups.items())),
+                "seconds": attempt.seconds(),
+            },
+        )
+
+
+def _batches(seeds: Sequence[int]) -> Iterator[list[int]]:
+    """Runs of consecutive seeds, at most BATCH long."""
+    batch: list[int] = []
+    for seed in seeds:
+        if batch and (seed != batch[-1] + 1 or len(batch) == BATCH):
+            yield batch
+            batch = []
+        batch.append(seed)
+    if batch:
+        yield batch
+
+
+def _store(attempt: Attempt, plan: CollectPlan, policy: Policy, seeds: list[int]) -> None:
+    trajectories = rollout(policy, RolloutConfig(episodes=len(seeds), seed=seeds[0]))
+    files = [attempt.bench.artifacts.put(trajectory.to_bytes()) for trajectory in trajectories]
+    with attempt.step() as session:
+        session.add_all(
+            _episode(attempt, plan, seed, trajectory, file)
+            for seed, trajectory, file in zip(seeds, trajectories, files, strict=True)
+        )
+
+
+def _episode(
+    attempt: Attempt, plan: CollectPlan, seed: int, trajectory: Trajectory, file: str
+) -> Episode:
+    outcome: dict[str, Any] = trajectory.outcome
+    return Episode(
+        campaign_id=attempt.facts.campaign_id,
+        checkpoint_id=plan.checkpoint_id,
+        job_id=attempt.facts.id,
+        seed=seed,
+        artifact_sha256=file,
+        steps=len(trajectory.actions),
+        success=trajectory.success,
+        mode=outcome["mode"],
+        group=outcome["group"],
+        outcome=outcome,
+        path=thin_path(trajectory),
+        mujoco_version=trajectory.info["mujoco_version"],
+        created_at=attempt.bench.clock(),
+    )
+
+
+def _episodes(session: Session, attempt: Attempt, plan: CollectPlan) -> Sequence[Episode]:
+    """The job's episodes that are stored, by seed."""
+    return session.scalars(
+        select(Episode)
+        .where(
+            Episode.campaign_id == attempt.facts.campaign_id,
+            Episode.checkpoint_id == plan.checkpoint_id,
+            Episode.seed >= plan.seeds.start,
+            Episode.seed < plan.seeds.stop,
+        )
+        .order_by(Episode.seed)
+    ).all()
+
+
+def _add_pairs(
+    session: Session, attempt: Attempt, plan: CollectPlan, episodes: Sequence[Episode]
+) -> int:
+    """Store the chosen pairs with one replay job each; returns how many are new."""
+    chosen = choose_pairs(
+        [episode.group for episode in episodes],
+        count=plan.pairs,
+        strategy=plan.strategy,
+        random_share=plan.random_share,
+        rng=np.random.default_rng([plan.seed, PAIR_STREAM]),
+    )
+    sides = np.random.default_rng([plan.seed, SIDE_STREAM]).random(len(chosen)) < 0.5
+    known = _known_pairs(session, attempt.facts.campaign_id)
+    now = attempt.bench.clock()
+    pairs = [
+        Pair(
+            campaign_id=attempt.facts.campaign_id,
+            first_episode_id=episodes[item.first].id,
+            second_episode_id=episodes[item.second].id,
+            first_is_left=bool(left),
+            reason=item.reason,
+            state=PairState.WAITING,
+            created_at=now,
+        )
+        for item, left in zip(chosen, sides, strict=True)
+        if frozenset((episodes[item.first].id, episodes[item.second].id)) not in known
+    ]
+    session.add_all(pairs)
+    session.flush()
+    for pair in pairs:
+        jobs.enqueue(
+            session,
+            now,
+            kind=JobKind.REPLAY,
+            campaign_id=attempt.facts.campaign_id,
+            payload={},
+            pair_id=pair.id,
+            dedupe_key=f"replay:{pair.id}",
+        )
+    return len(pairs)
+
+
+def _known_pairs(session: Session, campaign_id: int) -> set[frozenset[int]]:
+    """Episode ids of all pairs of the campaign, in either order."""
+    rows = session.execute(
+        select(Pair.first_episode_id, Pair.second_episode_id).where(Pair.campaign_id == campaign_id)
+    )
+    return {frozenset((first, second)) for first, second in rows}

@@ -1,0 +1,177 @@
+"""Label snapshot → noise estimate → fine-tuning → candidate checkpoint.
+
+The learner keeps partial results in a folder of the round: an attempt that dies is taken up
+where it stood, by the next attempt on the same machine. On another machine it starts again and
+comes to the same weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import shutil
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from rodif_core.errors import LearningError
+from rodif_core.finetune import FinetuneResult, finetune
+from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
+from rodif_core.preferences.noise import CHOICES, Comparison, estimate_noise
+from rodif_core.preferences.pairs import Preference
+from rodif_core.spec import FinetuneConfig
+from rodif_core.trajectory import Trajectory
+from server import rounds
+from server.states import Choice, JobKind, RoundState
+from server.store import jobs
+from server.store.labels import snapshot_labels
+from server.store.tables import Checkpoint, Episode, Pair, Round
+from worker.attempt import Attempt
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a round learns from; indices point into `episode_files`."""
+
+    parent_file: str
+    config: FinetuneConfig
+    episode_files: tuple[str, ...]
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def preferences(self) -> list[Preference]:
+        """The comparisons that say which one is better."""
+        return [
+            Preference(item.first, item.second, item.annotator)
+            if item.choice == Choice.FIRST
+            else Preference(item.second, item.first, item.annotator)
+            for item in self.comparisons
+            if item.choice != Choice.EQUAL
+        ]
+
+
+def run(attempt: Attempt) -> None:
+    """Do the job, or what is left of it."""
+    round_id = attempt.facts.round_id
+    assert round_id is not None
+    with attempt.step() as session:
+        rounds.move(session, attempt.bench.clock(), round_id, RoundState.FINETUNING)
+        lesson = read_lesson(session, round_id)
+    attempt.progress("noise", 0.0)
+    noise, config = choose_conservativeness(lesson)
+    with attempt.step() as session:
+        session.get_one(Round, round_id).noise = noise
+    artifacts = attempt.bench.artifacts
+    workspace = attempt.bench.scratch(f"round-{round_id}")
+    workspace.mkdir(parents=True, exist_ok=True)
+    result = finetune(
+        load_checkpoint(artifacts.get(lesson.parent_file)),
+        [Trajectory.from_bytes(artifacts.get(file)) for file in lesson.episode_files],
+        lesson.preferences,
+        config,
+        workspace=workspace,
+        progress=attempt.progress,
+    )
+    file = artifacts.put(save_checkpoint(result.checkpoint))
+    with attempt.step() as session:
+        checkpoint_id = _store(session, attempt, result, file)
+        attempt.finish(session, {"checkpoint_id": checkpoint_id, "seconds": attempt.seconds()})
+    shutil.rmtree(workspace, ignore_errors=True)
+
+
+def read_lesson(session: Session, round_id: int) -> Lesson:
+    """The round's parent, configuration and labels, in the order of the snapshot.
+
+    Raises LearningError when no label says which episode is better.
+    """
+    this = session.get_one(Round, round_id)
+    labels = snapshot_labels(session, this.snapshot_digest)
+    wanted = [label for label in labels if label.choice in CHOICES]
+    if not any(label.choice in (Choice.FIRST, Choice.SECOND) for label in wanted):
+        raise LearningError(
+            f"round {round_id} has {len(labels)} labels, but none says which episode is better"
+        )
+    pairs = _by_id(session, Pair, {label.pair_id for label in wanted})
+    used = {e for p in pairs.values() for e in (p.first_episode_id, p.second_episode_id)}
+    episodes = _by_id(session, Episode, used)
+    index = {episode_id: i for i, episode_id in enumerate(sorted(episodes))}
+    comparisons = tuple(
+        Comparison(
+            first=index[pairs[label.pair_id].first_episode_id],
+            second=index[pairs[label.pair_id].second_episode_id],
+            choice=label.choice,
+            annotator=label.annotator_id,
+            first_was_left=label.left_episode_id == pairs[label.pair_id].first_episode_id,
+        )
+        for label in wanted
+    )
+    return Lesson(
+        parent_file=session.get_one(Checkpoint, this.parent_checkpoint_id).artifact_sha256,
+        config=FinetuneConfig.from_json(this.config),
+        episode_files=tuple(episodes[i].artifact_sha256 for i in sorted(episodes)),
+        comparisons=comparisons,
+    )
+
+
+def _by_id(session: Session, table: Any, ids: set[int]) -> dict[int, Any]:
+    """Rows of one table, in portions below the engines' parameter limits."""
+    wanted, rows = sorted(ids), {}
+    for start in range(0, len(wanted), 500):
+        portion = wanted[start : start + 500]
+        for row in session.scalars(select(table).where(table.id.in_(portion))):
+            rows[row.id] = row
+    return rows
+
+
+def choose_conservativeness(lesson: Lesson) -> tuple[dict[str, Any], FinetuneConfig]:
+    """What the labels say about their noise, and the configuration with γ filled in.
+
+    A γ that was given stays; the estimate is stored beside it all the same.
+    """
+    estimate = estimate_noise(lesson.comparisons)
+    given = lesson.config.conservativeness
+    used = estimate.conservativeness if given is None else given
+    noise = estimate.to_json() | {
+        "conservativeness": used,
+        "source": "estimated" if given is None else "given",
+    }
+    if given is not None:
+        noise["notes"] = [*noise["notes"], f"γ = {given:g} was given with the round"]
+    return noise, dataclasses.replace(lesson.config, conservativeness=used)
+
+
+def _store(session: Session, attempt: Attempt, result: FinetuneResult, file: str) -> int:
+    """Insert the candidate and queue its evaluation; returns the checkpoint's id."""
+    now, round_id = attempt.bench.clock(), attempt.facts.round_id
+    assert round_id is not None
+    this = session.get_one(Round, round_id)
+    parent = session.get_one(Checkpoint, this.parent_checkpoint_id)
+    candidate = Checkpoint(
+        task=parent.task,
+        name=f"{parent.task}-round-{round_id}",
+        digest=result.checkpoint.digest,
+        artifact_sha256=file,
+        parent_id=parent.id,
+        round_id=round_id,
+        snapshot_digest=this.snapshot_digest,
+        config=dict(parent.config),
+        metrics={"finetune": result.report},
+        code_version=importlib.metadata.version("rodif-studio"),
+        created_at=now,
+    )
+    session.add(candidate)
+    session.flush()
+    rounds.move(session, now, round_id, RoundState.EVALUATING)
+    jobs.enqueue(
+        session,
+        now,
+        kind=JobKind.EVALUATE,
+        campaign_id=this.campaign_id,
+        round_id=round_id,
+        payload={},
+        dedupe_key=f"evaluate:{round_id}",
+        created_by=this.started_by,
+    )
+    return candidate.id
