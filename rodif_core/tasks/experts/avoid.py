@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rodif_core.errors import UnknownNameError
-from rodif_core.tasks.avoid import FINISH_Y, ROWS, AvoidTask
+from rodif_core.errors import LearningError, UnknownNameError
+from rodif_core.tasks.avoid import FINISH_Y, ROWS, START, AvoidTask
 from rodif_core.tasks.panda import ROD_RADIUS
 
 Array = NDArray[np.float64]
@@ -27,10 +27,10 @@ CROSSINGS = (
 )
 EXIT_Y = 0.42  # m; the path's last point, past the finish line
 EXIT_PULL = 0.15  # share of the way back to the middle, x = 0.5, between the last row and EXIT_Y
-SLOPE = (
-    0.7  # of the slope between a crossing's neighbours: how early the path turns to the next gap
-)
+OUTER_EARLY = 0.02  # m of y: paths around the last row get out that much before it
+SLOPE = 0.4  # of the slope between the neighbours: how early a path turns to its next gap
 MIN_CLEARANCE = 0.008  # m between rod and cylinder, everywhere on the path
+MAX_DRAWS = 200  # of one path; measured: the hardest modes need about 1
 LOOK_AHEAD = 0.03  # m of y
 SPEEDS = (0.0088, 0.0116)  # m per control step, a draw per episode; D3IL's stick was at 0.0125
 TREMBLE = 0.0008  # m per control step: standard deviation of the hand's noise on each axis
@@ -56,8 +56,10 @@ class AvoidExpert:
             raise UnknownNameError("mode", mode, AvoidTask.modes)
         gaps = ("LR".index(mode[0]), int(mode[2]) - 1, int(mode[3]) - 1)
         rows_y = [row[0][1] for row in ROWS]
+        if gaps[2] in (0, 3):
+            rows_y[2] -= OUTER_EARLY
         speed = float(rng.uniform(*SPEEDS))
-        while True:
+        for _ in range(MAX_DRAWS):
             crossings = [
                 float(rng.uniform(middle - width, middle + width))
                 for middle, width in (CROSSINGS[i][gap] for i, gap in enumerate(gaps))
@@ -71,6 +73,10 @@ class AvoidExpert:
             )
             if expert.clearance() >= MIN_CLEARANCE:
                 return expert
+        raise LearningError(
+            f"no clear path of mode {mode} from {start} in {MAX_DRAWS} draws; "
+            f"starts belong around {START}"
+        )
 
     def x(self, y: Array | float) -> Array:
         """The path's x (m) at y (m): cubic Hermite between the knots."""
