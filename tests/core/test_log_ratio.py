@@ -1,0 +1,120 @@
+"""Exact full-batch gradients, zero at the reference, pairing rules."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rodif_core.errors import LearningError
+from rodif_core.log_ratio import (
+    PairMatrix,
+    Transitions,
+    accumulate_gradient,
+    compute_ratios,
+    preference_loss,
+)
+from rodif_core.preferences.pairs import Preference
+from rodif_core.spec import FinetuneConfig, FinetuneMethod, Reduction, StepPairing
+from tests.core.learning import chain_trajectory, tiny_policy
+
+CONFIG = FinetuneConfig(conservativeness=0.3, chunk_rows=8)
+PREFERENCES = [Preference(0, 1), Preference(2, 1), Preference(0, 3)]
+
+
+def batch(seed: int = 0) -> tuple:
+    """A reference, a moved policy, and four trajectories of unequal length."""
+    reference = tiny_policy(seed)
+    moved = tiny_policy(seed).copy()
+    generator = torch.Generator().manual_seed(9)
+    with torch.no_grad():
+        for value in moved.denoiser.parameters():
+            value.add_(0.02 * torch.randn(value.shape, generator=generator))
+    trajectories = [chain_trajectory(reference, n, seed=n) for n in (3, 2, 4, 3)]
+    transitions = Transitions.collect(reference, trajectories, CONFIG.chunk_rows)
+    return reference, moved, transitions
+
+
+@pytest.mark.parametrize("chunk_rows", [4, 8, 13, 1000])
+def test_ratios_are_exactly_zero_and_votes_one_half_at_the_reference(chunk_rows: int) -> None:
+    reference = tiny_policy(0)
+    trajectories = [chain_trajectory(reference, n, seed=n) for n in (3, 2, 4, 3)]
+    config = replace(CONFIG, chunk_rows=chunk_rows)
+    transitions = Transitions.collect(reference, trajectories, chunk_rows)
+    ratios = compute_ratios(reference.copy(), transitions, config)
+    assert torch.equal(ratios, torch.zeros(12))
+    matrix = PairMatrix.build(transitions, PREFERENCES, config)
+    assert preference_loss(ratios, matrix, config).metrics["mean_vote"] == 0.5
+
+
+@pytest.mark.parametrize("method", [FinetuneMethod.RODIF, FinetuneMethod.DP_DPO])
+@pytest.mark.parametrize("reduction", list(Reduction))
+def test_chunked_gradient_equals_the_plain_one(
+    method: FinetuneMethod, reduction: Reduction
+) -> None:
+    _, moved, transitions = batch()
+    config = replace(CONFIG, method=method, reduction=reduction, group_size=2)
+    matrix = PairMatrix.build(transitions, PREFERENCES, config)
+    gradients = []
+    for rows in (4, 1_000_000):
+        moved.denoiser.zero_grad(set_to_none=True)
+        accumulate_gradient(
+            moved, transitions, replace(config, chunk_rows=rows),
+            lambda ratios: preference_loss(ratios, matrix, config),
+        )  # fmt: skip
+        gradients.append(torch.cat([value.grad.flatten() for value in moved.denoiser.parameters()]))
+    assert float(gradients[0].abs().max()) > 0
+    assert torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-6)
+
+
+def test_accumulated_gradient_equals_finite_differences_in_a_parameter_direction() -> None:
+    _, moved, transitions = batch()
+    policy = replace(moved, denoiser=moved.denoiser.double())
+    double = replace(
+        transitions, histories=transitions.histories.double(),
+        chains=transitions.chains.double(), ref_means=transitions.ref_means.double(),
+    )  # fmt: skip
+    matrix = PairMatrix.build(transitions, PREFERENCES, CONFIG)
+    matrix = replace(matrix, weights=matrix.weights.double())
+
+    def loss_of_ratios(ratios: torch.Tensor):
+        return preference_loss(ratios, matrix, CONFIG)
+
+    accumulate_gradient(policy, double, CONFIG, loss_of_ratios)
+    parameter = policy.denoiser.output[1].weight
+    direction = torch.randn(
+        parameter.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    slope = float((parameter.grad * direction).sum())
+    step, values = 1e-5, []
+    for sign in (1, -1):
+        with torch.no_grad():
+            parameter.add_(sign * step * direction)
+        values.append(float(loss_of_ratios(compute_ratios(policy, double, CONFIG)).loss))
+        with torch.no_grad():
+            parameter.sub_(sign * step * direction)
+    assert slope == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-4)
+
+
+def test_pairs_are_compared_over_the_shorter_trajectory() -> None:
+    _, _, transitions = batch()
+    matrix = PairMatrix.build(transitions, PREFERENCES, CONFIG)
+    assert matrix.weights.sum(1).tolist() == [2, 2, 3]
+    # Trajectory rows: 0-2, 3-4, 5-8, 9-11.
+    assert matrix.winners[0, :2].tolist() == [0, 1]
+    assert matrix.losers[2].tolist() == [9, 10, 11]
+
+
+def test_matched_state_weighs_a_step_by_the_distance_of_its_states() -> None:
+    _, _, transitions = batch()
+    config = replace(CONFIG, step_pairing=StepPairing.MATCHED_STATE, matched_state_scale=0.5)
+    matrix = PairMatrix.build(transitions, [Preference(0, 1)], config)
+    distance = (transitions.histories[0, -1] - transitions.histories[3, -1]).norm()
+    assert float(matrix.weights[0, 0]) == pytest.approx(float(torch.exp(-2 * distance**2)))
+
+
+def test_pair_matrix_without_preferences_says_what_to_do() -> None:
+    _, _, transitions = batch()
+    with pytest.raises(LearningError, match="label some pairs"):
+        PairMatrix.build(transitions, [], CONFIG)
