@@ -26,7 +26,7 @@ PARALLEL = 100  # simulations stepped together; changes the time, not the result
 MAX_ATTEMPTS = 20  # draws for one demonstration before we say that something is wrong
 
 _FORMAT = 1
-_STEP_ARRAYS = ("observations", "qpos", "paths")  # one row more than actions
+_ARRAYS = ("observations", "actions", "qpos", "paths")
 
 
 @dataclass(frozen=True)
@@ -163,9 +163,7 @@ def _trajectory(
         actions=actions[:length].copy(),
         qpos=qpos[: length + 1].copy(),
         paths=paths[: length + 1].copy(),
-        histories=np.zeros((0, 1, task.observation_dim), np.float32),
-        chains=np.zeros((0, 1, 1, task.action_dim), np.float32),
-        decision_steps=np.zeros(0, np.int32),
+        **_no_decisions(task.observation_dim, task.action_dim),
         context=context,
         outcome=outcome,
         info={
@@ -176,3 +174,84 @@ def _trajectory(
             **info,
         },
     )
+
+
+def save_demonstrations(path: Path, demonstrations: Sequence[Trajectory]) -> None:
+    """Write a set to one npz file: episodes' arrays end to end, and a JSON header. No pickle.
+
+    Equal sets give equal bytes. Raises ValueOutOfRangeError for an empty set.
+    """
+    if not demonstrations:
+        raise ValueOutOfRangeError("number of demonstrations", 0, "at least 1")
+    header = {
+        "format": _FORMAT,
+        "lengths": [len(one.actions) for one in demonstrations],
+        "episodes": [
+            {"context": one.context, "outcome": one.outcome, "info": one.info}
+            for one in demonstrations
+        ],
+    }
+    text = json.dumps(header, sort_keys=True).encode()
+    arrays = {"header": np.frombuffer(text, dtype=np.uint8)}
+    for name in _ARRAYS:
+        arrays[name] = np.concatenate([getattr(one, name) for one in demonstrations])
+    buffer = io.BytesIO()
+    # numpy's savez stamps the time of day into the archive, so the members are written by hand.
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, array, allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            archive.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED)
+    path.write_bytes(buffer.getvalue())
+
+
+def load_demonstrations(path: Path) -> list[Trajectory]:
+    """Read a set back; raises TrajectoryFileError when the file is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(archive["header"].tobytes())
+            columns = {name: archive[name] for name in _ARRAYS}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise TrajectoryFileError(f"{path} is not a readable demonstration set: {error}") from error
+    if header.get("format") != _FORMAT:
+        raise TrajectoryFileError(
+            f"{path} has format {header.get('format')!r}; this version reads {_FORMAT}"
+        )
+    lengths = np.array(header["lengths"], dtype=int)
+    for name, column in columns.items():
+        rows = int(lengths.sum()) + (0 if name == "actions" else len(lengths))
+        if len(column) != rows or len(header["episodes"]) != len(lengths):
+            raise TrajectoryFileError(
+                f"{path}: {name} has {len(column)} rows, but its header tells of {rows}"
+            )
+    return _cut(lengths, columns, header["episodes"])
+
+
+def _cut(
+    lengths: NDArray[np.int_], columns: dict[str, NDArray[Any]], episodes: list[dict[str, Any]]
+) -> list[Trajectory]:
+    """Cut columns that hold episodes end to end into trajectories."""
+    pieces = {
+        name: np.split(column, np.cumsum(lengths if name == "actions" else lengths + 1)[:-1])
+        for name, column in columns.items()
+    }
+    return [
+        Trajectory(
+            **{name: pieces[name][i].copy() for name in _ARRAYS},
+            **_no_decisions(pieces["observations"][i].shape[1], pieces["actions"][i].shape[1]),
+            context=episode["context"],
+            outcome=episode["outcome"],
+            info=episode["info"],
+        )
+        for i, episode in enumerate(episodes)
+    ]
+
+
+def _no_decisions(observation_dim: int, action_dim: int) -> dict[str, NDArray[Any]]:
+    """The arrays of an episode that no policy decided: T = 0, with the right ranks."""
+    return {
+        "histories": np.zeros((0, 1, observation_dim), np.float32),
+        "chains": np.zeros((0, 1, 1, action_dim), np.float32),
+        "decision_steps": np.zeros(0, np.int32),
+    }

@@ -52,7 +52,9 @@ class BatchEnv:
         self._contact = int(model.sensor(CONTACT_SENSOR).adr[0])
         self._setpoints = np.zeros((n, 3))
         self._ends = np.zeros((n, 3))
-        self._history = np.zeros((task.max_steps + 1, n, 3))
+        self._joints = np.zeros((n, model.nq))
+        # float32, as trajectories store it: modes can be read again from what was stored.
+        self._history = np.zeros((task.max_steps + 1, n, 3), dtype=np.float32)
         self._steps = np.zeros(n, dtype=np.int64)
         self._reasons: list[str | None] = [None] * n
         self._episodes = 0
@@ -77,6 +79,7 @@ class BatchEnv:
         self._episodes = count
         self._setpoints = starts
         self._ends = self._tip[ids]
+        self._joints = self._qpos[ids]
         self._history[0, :count] = self._ends
         self._steps = np.zeros(count, dtype=np.int64)
         self._reasons = [None] * count
@@ -93,16 +96,16 @@ class BatchEnv:
         Returns observations (m, O) float32. A simulation with a non-finite action or state is
         ended with reason "diverged"; the others go on.
         """
-        actions = np.asarray(actions, dtype=np.float64)
+        wanted = np.array(actions, dtype=np.float64)
         shape = (self._episodes, self.task.action_dim)
-        if actions.shape != shape:
-            raise ValueOutOfRangeError("shape of actions", actions.shape, f"{shape}")
+        if wanted.shape != shape:
+            raise ValueOutOfRangeError("shape of actions", wanted.shape, f"{shape}")
         moving = ~self._done if active is None else ~self._done & np.asarray(active, dtype=bool)
-        finite = np.isfinite(actions).all(axis=1)
+        finite = np.isfinite(wanted).all(axis=1)
         self._end(np.flatnonzero(moving & ~finite), DIVERGED)
         ids = np.flatnonzero(moving & finite)
         if len(ids):
-            self._advance(ids, actions[ids])
+            self._advance(ids, wanted[ids])
         return self._observations()
 
     def _advance(self, ids: NDArray[np.int64], actions: NDArray[np.float64]) -> None:
@@ -111,13 +114,14 @@ class BatchEnv:
         setpoints = self.task.move(self._setpoints[ids], np.clip(actions, -limit, limit))
         self._ctrl[ids] = self._kinematics.solve(setpoints, self._ctrl[ids])
         touched, failed = self._physics(ids)
-        ends = self._tip[ids]
-        failed |= ~np.isfinite(ends).all(axis=1) | ~np.isfinite(self._qpos[ids]).all(axis=1)
+        ends, joints = self._tip[ids], self._qpos[ids]
+        failed |= ~np.isfinite(ends).all(axis=1) | ~np.isfinite(joints).all(axis=1)
         self._end(ids[failed], DIVERGED)
         good = ~failed
         ids, ends, touched = ids[good], ends[good], touched[good]
         self._setpoints[ids] = setpoints[good]
         self._ends[ids] = ends
+        self._joints[ids] = joints[good]
         self._steps[ids] += 1
         self._history[self._steps[ids], ids] = ends
         # The first reason that holds counts: contact comes before everything else.
@@ -163,13 +167,13 @@ class BatchEnv:
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """(m,) control steps done so far."""
+        """(m,) control steps done so far: N of the trajectory. A step that diverged is not one."""
         return self._steps.copy()
 
     @property
     def qpos(self) -> NDArray[np.float32]:
         """(m, Q) float32 positions of the physics."""
-        return self._qpos[: self._episodes].astype(np.float32)
+        return self._joints.astype(np.float32)
 
     @property
     def paths(self) -> NDArray[np.float32]:

@@ -20,8 +20,9 @@ PHYSICS_DT = 0.0025  # s per physics step
 PHYSICS_STEPS = 14  # physics steps per control step
 CONTROL_DT = PHYSICS_DT * PHYSICS_STEPS  # 35 ms = 28.57 Hz, as D3IL
 
-# Joint positions (rad) with the rod straight down, in the middle of the table: the posture that
-# redundancy is resolved towards. Joints 6 and 7 of these files are pi/2 and pi/4 off the real arm's.
+# Joint positions (rad) with the rod straight down and its tip at (0.5, 0, 0.03) m: the posture that
+# redundancy is resolved towards. Joints 6 and 7 of these files are pi/2 and pi/4 off the real
+# arm's.
 HOME_QPOS = (0.0, 0.223, 0.0, -2.401, 0.0, 1.054, 0.0)
 
 TOOL_BODY = "panda0_link7"

@@ -19,7 +19,7 @@ from rodif_core.tasks.panda import ROD_RADIUS
 
 Array = NDArray[np.float64]
 
-# Where the path crosses each row: middle and half-width (m) of a uniform draw, per gap from the left.
+# Where paths cross each row: middle and half-width (m) of a uniform draw, gaps from the left.
 CROSSINGS = (
     ((0.425, 0.012), (0.575, 0.012)),
     ((0.350, 0.010), (0.500, 0.012), (0.650, 0.010)),

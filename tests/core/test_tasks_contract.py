@@ -1,0 +1,254 @@
+"""What every task must hold to, whatever it is: one test body, all tasks of TASKS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.tasks import TASKS, Task, get_task
+from rodif_core.tasks.base import REASONS
+from rodif_core.tasks.env import BatchEnv
+
+TASK_PARAMS = [pytest.param(task, id=name.value) for name, task in TASKS.items()]
+STEPS = 12
+
+pytestmark = pytest.mark.parametrize("task", TASK_PARAMS)
+
+
+def contexts_of(task: Task, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    return [task.sample_context(np.random.default_rng(seed)) for seed in seeds]
+
+
+def actions_of(task: Task, seeds: Sequence[int], steps: int = STEPS) -> NDArray[np.float32]:
+    """Random actions (steps, len(seeds), A) that drift forward; a seed's column is its own."""
+    columns = [
+        np.random.default_rng(seed).uniform(-1, 1, (steps, task.action_dim)) for seed in seeds
+    ]
+    return np.asarray(task.action_limit * np.stack(columns, axis=1), dtype=np.float32)
+
+
+def play(env: BatchEnv, contexts: Sequence[dict[str, Any]], actions: NDArray[Any]) -> dict[str, Any]:
+    """Everything that an environment hands out, after every step."""
+    rows = {"observations": [env.reset(contexts)], "qpos": [env.qpos], "paths": [env.paths]}
+    for action in actions:
+        rows["observations"].append(env.step(action))
+        rows["qpos"].append(env.qpos)
+        rows["paths"].append(env.paths)
+    return {name: np.stack(values, axis=1) for name, values in rows.items()}
+
+
+def assert_same_bits(first: dict[str, Any], second: dict[str, Any]) -> None:
+    for name in first:
+        assert first[name].tobytes() == second[name].tobytes(), name
+
+
+def test_observations_are_finite_and_of_the_promised_size(task: Task) -> None:
+    record = play(BatchEnv(task, 3), contexts_of(task, [1, 2, 3]), actions_of(task, [1, 2, 3]))
+
+    assert record["observations"].shape == (3, STEPS + 1, task.observation_dim)
+    assert record["observations"].dtype == np.float32
+    assert record["paths"].shape == (3, STEPS + 1, 3)
+    assert record["qpos"].dtype == np.float32
+    assert all(np.isfinite(values).all() for values in record.values())
+
+
+def test_same_context_and_actions_give_the_same_bits_when_an_environment_is_used_again(
+    task: Task,
+) -> None:
+    env = BatchEnv(task, 2)
+    contexts, actions = contexts_of(task, [1, 2]), actions_of(task, [1, 2])
+    first = play(env, contexts, actions)
+    play(env, contexts_of(task, [5, 6]), actions_of(task, [5, 6]))
+
+    assert_same_bits(first, play(env, contexts, actions))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("count", [2, 7, 33])
+def test_an_episode_has_the_same_bits_alone_and_among_others(
+    task: Task, count: int, threads: int
+) -> None:
+    seeds = list(range(count))
+    together = play(
+        BatchEnv(task, count, threads), contexts_of(task, seeds), actions_of(task, seeds)
+    )
+    alone = BatchEnv(task, 1)
+    for index in {0, count // 2, count - 1}:
+        single = play(alone, contexts_of(task, [index]), actions_of(task, [index]))
+        assert_same_bits(single, {name: rows[index][None] for name, rows in together.items()})
+
+
+def test_a_smaller_batch_in_a_larger_environment_changes_no_bit(task: Task) -> None:
+    seeds = [4, 5, 6]
+    exact = play(BatchEnv(task, 3), contexts_of(task, seeds), actions_of(task, seeds))
+    roomy = play(BatchEnv(task, 10), contexts_of(task, seeds), actions_of(task, seeds))
+
+    assert_same_bits(exact, roomy)
+
+
+def test_simulations_that_are_not_active_stay_as_they_are(task: Task) -> None:
+    env = BatchEnv(task, 2)
+    start = env.reset(contexts_of(task, [1, 2]))
+    actions = actions_of(task, [1, 2])
+    for action in actions:
+        end = env.step(action, active=np.array([True, False]))
+
+    assert end[1].tobytes() == start[1].tobytes()
+    assert env.steps.tolist() == [STEPS, 0]
+    alone = play(BatchEnv(task, 1), contexts_of(task, [1]), actions[:, :1])
+    assert end[0].tobytes() == alone["observations"][0, -1].tobytes()
+
+
+def test_returned_arrays_are_copies(task: Task) -> None:
+    env = BatchEnv(task, 2)
+    contexts = contexts_of(task, [1, 2])
+    handed_out = [env.reset(contexts), env.qpos, env.paths, env.steps, env.done]
+    before = [array.copy() for array in handed_out]
+    action = actions_of(task, [1, 2])[0]
+    after = env.step(action)
+    for array, old in zip(handed_out, before, strict=True):
+        assert array.tobytes() == old.tobytes()
+
+    for array in (after, env.qpos, env.paths, env.steps, env.done):
+        array.fill(1)
+    again = BatchEnv(task, 2)
+    again.reset(contexts)
+    again.step(action)
+    assert env.step(action).tobytes() == again.step(action).tobytes()
+
+
+def test_a_caller_that_reuses_its_action_array_changes_nothing_afterwards(task: Task) -> None:
+    env = BatchEnv(task, 1)
+    env.reset(contexts_of(task, [1]))
+    action = actions_of(task, [1])[0]
+    observation = env.step(action)
+    kept = observation.copy()
+    action.fill(np.nan)
+    assert observation.tobytes() == kept.tobytes()
+    assert not env.done[0]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_non_finite_action_ends_only_its_own_episode(task: Task, bad: float) -> None:
+    seeds = [1, 2, 3]
+    contexts, actions = contexts_of(task, seeds), actions_of(task, seeds)
+    clean = play(BatchEnv(task, 3), contexts, actions)
+    actions[4, 1, 0] = bad
+    env = BatchEnv(task, 3)
+    record = play(env, contexts, actions)
+
+    assert env.done.tolist() == [False, True, False]
+    assert env.steps.tolist() == [STEPS, 4, STEPS]
+    for name in clean:
+        assert record[name][[0, 2]].tobytes() == clean[name][[0, 2]].tobytes()
+        assert np.isfinite(record[name]).all()
+        assert record[name][1, 4:].tobytes() == np.repeat(record[name][1, 4:5], 9, 0).tobytes()
+
+
+def test_physics_that_blows_up_ends_only_its_own_episode(task: Task) -> None:
+    seeds = [1, 2, 3]
+    contexts, actions = contexts_of(task, seeds), actions_of(task, seeds)
+    clean = play(BatchEnv(task, 3), contexts, actions)
+    env = BatchEnv(task, 3)
+    env.reset(contexts)
+    env._batch.bind("qvel")[1] = 1e12
+    for action in actions:
+        observation = env.step(action)
+
+    assert env.done.tolist() == [False, True, False]
+    assert observation[[0, 2]].tobytes() == clean["observations"][[0, 2], -1].tobytes()
+    assert np.isfinite(observation).all() and np.isfinite(env.qpos).all()
+    hold = np.zeros((3, task.action_dim))
+    while not env.done.all():
+        env.step(hold)
+    outcome = env.outcomes()[1]
+    assert outcome["reason"] == "diverged" and not outcome["success"]
+
+
+def test_an_episode_that_gets_nowhere_ends_at_the_time_limit(task: Task) -> None:
+    env = BatchEnv(task, 1)
+    env.reset(contexts_of(task, [1]))
+    for _ in range(task.max_steps - 1):
+        env.step(np.zeros((1, task.action_dim)))
+    assert not env.done[0]
+    env.step(np.zeros((1, task.action_dim)))
+
+    assert env.done[0]
+    assert env.outcomes() == [
+        {"success": False, "mode": None, "group": None, "reason": "time_limit"}
+    ]
+
+
+def test_outcomes_are_refused_before_all_episodes_have_ended(task: Task) -> None:
+    env = BatchEnv(task, 1)
+    env.reset(contexts_of(task, [1]))
+    with pytest.raises(ValueError, match="episode 0 has not ended"):
+        env.outcomes()
+
+
+def test_actions_of_the_wrong_shape_are_refused(task: Task) -> None:
+    env = BatchEnv(task, 2)
+    env.reset(contexts_of(task, [1, 2]))
+    with pytest.raises(ValueOutOfRangeError, match=rf"\(1, {task.action_dim}\).*\(2, "):
+        env.step(np.zeros((1, task.action_dim)))
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_wrong_number_of_contexts_is_refused(task: Task, count: int) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=rf"contexts is {count}.*1 … 2"):
+        BatchEnv(task, 2).reset(contexts_of(task, list(range(count))))
+
+
+@pytest.mark.parametrize(("n", "threads"), [(0, 1), (1, 0), (-1, 1)])
+def test_an_environment_needs_a_simulation_and_a_thread(task: Task, n: int, threads: int) -> None:
+    with pytest.raises(ValueOutOfRangeError, match="at least 1"):
+        BatchEnv(task, n, threads)
+
+
+def test_contexts_survive_json_and_depend_on_the_seed_alone(task: Task) -> None:
+    first, second, other = contexts_of(task, [1, 1, 2])
+    assert first == second
+    assert first != other
+    assert json.loads(json.dumps(first)) == first
+
+
+def test_constants_agree_with_each_other(task: Task) -> None:
+    assert TASKS[task.name] is task
+    assert len(set(task.modes)) == len(task.modes)
+    assert task.preferred_group in task.groups
+    assert task.criterion.endswith(".")
+    assert task.action_limit > 0 and task.control_dt > 0
+
+
+def test_scene_shapes_survive_json(task: Task) -> None:
+    shapes = task.scene_shapes()
+    assert json.loads(json.dumps(shapes)) == shapes
+    assert all("type" in shape for shape in shapes)
+
+
+def test_both_meshes_are_the_same_physics(task: Task) -> None:
+    low, detailed = task.build_model("col"), task.build_model("viz")
+    assert detailed.nmeshface > 10 * low.nmeshface
+    assert np.array_equal(low.body_mass, detailed.body_mass)
+    assert np.allclose(low.body_inertia, detailed.body_inertia, rtol=1e-12)
+    assert np.array_equal(low.actuator_gainprm, detailed.actuator_gainprm)
+
+
+def test_get_task_finds_a_task_by_its_text(task: Task) -> None:
+    assert get_task(task.name.value) is task
+
+
+def test_an_unknown_task_is_refused_with_the_legal_names(task: Task) -> None:
+    with pytest.raises(UnknownNameError, match=rf"'juggle'.*'{task.name.value}'"):
+        get_task("juggle")
+
+
+def test_an_unknown_reason_is_refused(task: Task) -> None:
+    with pytest.raises(UnknownNameError, match=f"'tired'.*'{REASONS[0]}'"):
+        task.outcome(np.zeros((1, 3)), "tired")
