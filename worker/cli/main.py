@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from rodif_core.errors import RodifError
-from worker.cli import bench, demo, doctor, evaluate, pretrain, round, simulate, up
+from worker.cli import bench, demo, doctor, evaluate, migrate, pretrain, round, simulate, up
 
 COMMANDS = {
     "up": up,
@@ -18,6 +18,7 @@ COMMANDS = {
     "pretrain": pretrain,
     "bench": bench,
     "doctor": doctor,
+    "migrate": migrate,
 }
 
 
@@ -37,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 when it did what was asked, 1 on an error, 130 on Ctrl-C."""
     args = build_parser().parse_args(arguments)
     try:
-        return COMMANDS[args.command].run(args)
+        status: int = COMMANDS[args.command].run(args)
+        return status
     except RodifError as error:
         print(f"rodif {args.command}: {error}", file=sys.stderr)
         return 1

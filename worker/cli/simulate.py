@@ -160,14 +160,15 @@ def annotator_tokens(admin: Client, config: SimulationConfig) -> list[str]:
         name = f"{config.name}-{number}"
         account = accounts.get(name)
         if account is None:
-            body = {"name": name, "role": "service", "kind": "simulated"}
-            account = admin.post("/annotators", body)
+            account = admin.post(
+                "/annotators", {"name": name, "role": "service", "kind": "simulated"}
+            )
         if account["kind"] != "simulated":
             raise RodifError(
                 f"account {name!r} is a {account['kind']}, not simulated; choose another --name"
             )
-        body = {"annotator_id": account["id"], "name": "simulate", "days": 1}
-        tokens.append(admin.post("/tokens", body)["token"])
+        asked = {"annotator_id": account["id"], "name": "simulate", "days": 1}
+        tokens.append(admin.post("/tokens", asked)["token"])
     return tokens
 
 

@@ -1,0 +1,187 @@
+"""`rodif bench`: the fine-tuners on fresh seeds, one row a run, shown seed by seed.
+
+The JSON file is a list of rows and grows by one as each run ends; a second call with the same file
+makes only what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rodif_core.errors import RodifError
+from rodif_core.spec import FinetuneMethod, TaskName
+from worker.cli.benchmarks import avoid
+from worker.cli.options import number_list
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Row = Mapping[str, Any]
+FIELDS = tuple(
+    "method corruption labels design seed success alignment alignment_of_successes off_support"
+    " n updates checkpoint".split()
+)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows of an earlier call, [] when there is no file; raises RodifError for anything else."""
+    if not path.exists():
+        return []
+    try:
+        rows = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RodifError(f"{path} is not a benchmark's JSON file: {error}") from error
+    if not isinstance(rows, list) or any(set(FIELDS) - set(row) for row in rows):
+        raise RodifError(f"{path} is not a list of benchmark rows with {', '.join(FIELDS)}")
+    return rows
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Replace the file at once: a killed benchmark leaves whole rows."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    part.write_text(f"[\n{lines}\n]\n")
+    part.replace(path)
+
+
+def make_missing(runs: Sequence[avoid.Run], path: Path, workers: int) -> list[Row]:
+    """Make the rows that the file lacks, in `workers` processes; the rows of `runs`, in order."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from rodif_core.policies.checkpoint import load_checkpoint, shipped_checkpoint
+
+    rows = read_rows(path)
+    digest = load_checkpoint(shipped_checkpoint(TaskName.AVOID)).digest
+    if any(row["checkpoint"] != digest for row in rows):
+        raise RodifError(
+            f"{path} has rows of another checkpoint than the shipped {digest[:12]};"
+            " choose another file"
+        )
+    done = {avoid.key_of_row(row) for row in rows}
+    missing = [run for run in runs if run.key() not in done]
+    # Read by the children when they start: two processes with two threads each get in each
+    # other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with (
+        Progress(*columns, console=console) as bar,
+        ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        task = bar.add_task("runs", total=len(missing))
+        futures = [pool.submit(avoid.execute, run) for run in missing]
+        try:
+            for future in as_completed(futures):
+                rows.append(future.result())
+                write_rows(path, rows)
+                bar.advance(task)
+                console.print(_line(rows[-1]))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    by_key = {avoid.key_of_row(row): row for row in rows}
+    return [by_key[run.key()] for run in runs]
+
+
+def _line(row: Row) -> str:
+    return (
+        f"{row['method']} {row['design']} {row['corruption']:.0%} seed {row['seed']}:"
+        f" alignment {row['alignment']:.3f} success {row['success']:.3f}"
+        f" off-support {row['off_support']:.4f} ({row['seconds']:.0f} s)"
+    )
+
+
+def seed_table(rows: Sequence[Row], seeds: Sequence[int]) -> Table:
+    """One line a method, design and corruption; every seed in a column, then the mean."""
+    from rich.table import Table
+
+    table = Table(
+        title="alignment / success / off-support, in per cent of n rollouts", title_justify="left"
+    )
+    for heading in ("design", "corruption", "method", "labels"):
+        table.add_column(heading)
+    for seed in seeds:
+        table.add_column(f"seed {seed}", justify="right")
+    table.add_column("mean", justify="right")
+    cells: dict[tuple[Any, ...], dict[int, Row]] = {}
+    for row in rows:
+        cell = (row["design"], row["corruption"], row["method"], row["labels"])
+        cells.setdefault(cell, {})[row["seed"]] = row
+    for (design, corruption, method, labels), by_seed in cells.items():
+        measured = [_numbers(by_seed[seed]) for seed in seeds if seed in by_seed]
+        mean = tuple(sum(column) / len(measured) for column in zip(*measured, strict=True))
+        table.add_row(
+            design,
+            f"{corruption:.0%}",
+            method,
+            str(labels),
+            *(_cell(_numbers(by_seed[seed])) if seed in by_seed else "–" for seed in seeds),
+            _cell(mean),
+        )
+        if method == FinetuneMethod.RODIF and design == "product":
+            paper = avoid.PAPER_ROW.get(corruption)
+            if paper is not None:
+                note = f"{paper} / {paper} / –"
+                table.add_row("", "", "RoDiF in the paper", "400", *[""] * len(seeds), note)
+    return table
+
+
+def _numbers(row: Row) -> tuple[float, float, float]:
+    return (row["alignment"], row["success"], row["off_support"])
+
+
+def _cell(numbers: tuple[float, ...]) -> str:
+    alignment, success, off_support = (100 * number for number in numbers)
+    return f"{alignment:.0f} / {success:.0f} / {off_support:.1f}"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command's arguments."""
+    parser = subparsers.add_parser("bench", help="compare the fine-tuners on fresh seeds")
+    parser.add_argument("task", choices=[TaskName.AVOID.value])
+    parser.add_argument(
+        "--seeds",
+        type=number_list,
+        default=number_list("100-104"),
+        help="like 100-104 or 3,5,7 (default 100-104)",
+    )
+    parser.add_argument("--json", type=Path, required=True, help="file of rows; kept and completed")
+    parser.add_argument(
+        "--corruption",
+        type=float,
+        nargs="+",
+        default=[0.0, 0.2, 0.3, 0.4],
+        help="shares of flipped labels (default 0 0.2 0.3 0.4)",
+    )
+    parser.add_argument("--designs", nargs="+", choices=avoid.DESIGNS, default=list(avoid.DESIGNS))
+    methods = [method.value for method in FinetuneMethod]
+    parser.add_argument("--methods", nargs="+", choices=methods, default=methods)
+    parser.add_argument("--n", type=int, default=200, help="rollouts a row (default %(default)s)")
+    parser.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make what is missing, print the table; 1 when the default method misses a target."""
+    from rich.console import Console
+
+    methods = [FinetuneMethod(name) for name in args.methods]
+    runs = avoid.plan(args.seeds, args.designs, args.corruption, methods, args.n, args.updates)
+    rows = make_missing(runs, args.json, args.workers)
+    console = Console()
+    console.print(seed_table(rows, args.seeds))
+    missed = avoid.shortfalls(rows)
+    for sentence in missed:
+        console.print(f"missed: {sentence}")
+    if not missed and FinetuneMethod.RODIF_GUIDED in methods:
+        console.print(f"{FinetuneMethod.RODIF_GUIDED} holds all targets that were run")
+    return 1 if missed else 0

@@ -1,0 +1,1 @@
+"""Benchmarks of the fine-tuners, one module a task."""

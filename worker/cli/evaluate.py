@@ -1,0 +1,68 @@
+"""`rodif evaluate`: seeded rollouts of a checkpoint; success, alignment and drift."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from rodif_core.errors import CheckpointFileError
+from rodif_core.spec import RolloutConfig, TaskName
+
+
+def read_checkpoint(name: str) -> bytes:
+    """A task's shipped checkpoint by the task's name, or a file.
+
+    Raises CheckpointFileError when it is neither.
+    """
+    from rodif_core.policies.checkpoint import shipped_checkpoint
+
+    if name in list(TaskName):
+        return shipped_checkpoint(TaskName(name))
+    try:
+        return Path(name).read_bytes()
+    except OSError as error:
+        tasks = ", ".join(repr(task.value) for task in TaskName)
+        raise CheckpointFileError(
+            f"{name!r} is neither a readable file ({error.strerror}) nor a task with a shipped"
+            f" checkpoint: {tasks}"
+        ) from error
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command's arguments."""
+    parser = subparsers.add_parser("evaluate", help="roll a checkpoint out and sum up")
+    parser.add_argument("checkpoint", help="a .safetensors file, or a task: its shipped checkpoint")
+    parser.add_argument("--n", type=int, default=200, help="rollouts (default %(default)s)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="rollout i uses SEED + i (default %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Roll out with a progress bar, then print the table or the JSON."""
+    config = RolloutConfig(episodes=args.n, seed=args.seed)
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from rodif_core.evaluate import evaluate
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from worker.cli.tables import evaluation_table
+
+    checkpoint = load_checkpoint(read_checkpoint(args.checkpoint))
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        row = bar.add_task("rollouts", total=config.episodes)
+        result = evaluate(
+            checkpoint, config, progress=lambda done, _: bar.update(row, completed=done)
+        ).to_json()
+    if args.json:
+        print(json.dumps(result | {"checkpoint": checkpoint.digest, "seed": args.seed}))
+        return 0
+    console = Console()
+    title = f"{checkpoint.task.value}, seeds {args.seed} … {args.seed + args.n - 1}"
+    console.print(evaluation_table(title, [(checkpoint.digest[:12], result)]))
+    for kind in ("groups", "modes", "reasons"):
+        console.print(f"{kind}: " + ", ".join(f"{k} {v}" for k, v in result[kind].items()))
+    return 0

@@ -1,0 +1,120 @@
+"""`rodif round`: start a fine-tuning round by REST and follow it to its end."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from rodif_core.spec import FinetuneMethod, RolloutConfig
+from server.states import PublishRule
+from worker.cli.options import add_connection_arguments
+
+if TYPE_CHECKING:
+    from worker.cli.client import Client
+
+DEFAULT_PATIENCE_MINUTES = 60.0
+
+
+def launch(
+    api: Client,
+    campaign_id: int,
+    *,
+    method: FinetuneMethod | None = None,
+    publish_rule: PublishRule | None = None,
+    evaluation: RolloutConfig | None = None,
+    snapshot_digest: str | None = None,
+    updates: int | None = None,
+    conservativeness: float | None = None,
+) -> dict[str, Any]:
+    """Start a round; what is not given is taken from the campaign. Raises ApiError (409, 422)."""
+    config = {"method": method, "updates": updates, "conservativeness": conservativeness}
+    body: dict[str, Any] = {"config": {k: v for k, v in config.items() if v is not None}}
+    if publish_rule is not None:
+        body["publish_rule"] = publish_rule
+    if evaluation is not None:
+        body["evaluation"] = {"episodes": evaluation.episodes, "seed": evaluation.seed}
+    if snapshot_digest is not None:
+        body["snapshot_digest"] = snapshot_digest
+    started: dict[str, Any] = api.post(f"/campaigns/{campaign_id}/rounds", body)
+    return started
+
+
+def finished_tables(ended: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The evaluations of a round's result, by what to call them."""
+    result = ended["result"]
+    return {"before": result["before"], f"after ({ended['state']})": result["after"]}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command's arguments."""
+    parser = subparsers.add_parser("round", help="start a fine-tuning round and follow it")
+    add_connection_arguments(parser)
+    parser.add_argument(
+        "--method", choices=list(FinetuneMethod), help="default: what the campaign says"
+    )
+    parser.add_argument(
+        "--publish", choices=list(PublishRule), help="default: what the campaign says"
+    )
+    parser.add_argument("--episodes", type=int, help="rollouts of the evaluation")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="first seed of the evaluation, with --episodes"
+    )
+    parser.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
+    parser.add_argument(
+        "--conservativeness", type=float, help="γ in [0, 1); default: estimated from the labels"
+    )
+    parser.add_argument("--snapshot", help="digest of frozen labels to use again")
+    parser.add_argument("--json", action="store_true", help="print the finished round as JSON")
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        default=DEFAULT_PATIENCE_MINUTES,
+        help="stop waiting after this long; the round goes on (default %(default)s)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start, follow, print; 1 when the gate refused the candidate."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from worker.cli.client import Client
+    from worker.cli.tables import evaluation_table
+
+    evaluation = None
+    if args.episodes is not None:
+        evaluation = RolloutConfig(episodes=args.episodes, seed=args.seed)
+    with Client(args.url, args.token) as api:
+        started = launch(
+            api,
+            api.find_campaign(args.campaign)["id"],
+            method=args.method,
+            publish_rule=args.publish,
+            evaluation=evaluation,
+            snapshot_digest=args.snapshot,
+            updates=args.updates,
+            conservativeness=args.conservativeness,
+        )
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            row = bar.add_task(f"round {started['id']}", total=1.0)
+
+            def show(state: Mapping[str, Any]) -> None:
+                jobs = list(api.pages(f"/jobs?round_id={started['id']}"))
+                stage, done = (jobs[0]["stage"], jobs[0]["progress"]) if jobs else ("", 0.0)
+                text = f"round {state['id']} {state['state']} {stage}"
+                bar.update(row, description=text, completed=done)
+
+            ended = api.wait_for_round(started["id"], seconds=60 * args.minutes, progress=show)
+    if args.json:
+        print(json.dumps(ended))
+    else:
+        rows = list(finished_tables(ended).items())
+        Console().print(evaluation_table(f"round {ended['id']}", rows))
+    if ended["state"] == "rejected":
+        print(f"the gate refused: {ended['result'].get('gate')}", file=sys.stderr)
+        return 1
+    return 0
