@@ -83,7 +83,7 @@ def worker_service(name: str, queues: tuple[str, ...], concurrency: int) -> Serv
     command = (
         *(sys.executable, "-m", "celery", "-A", "worker.app", "worker"),
         *("-P", pool, "-c", str(concurrency), "-Q", ",".join(queues), "-n", f"{name}@%h"),
-        *("--without-gossip", "--without-mingle", "-l", "INFO"),
+        *("--without-gossip", "--without-mingle", "-l", "WARNING" if pool == "solo" else "INFO"),
     )
     return Service(name, command, signal.SIGQUIT)
 
@@ -91,7 +91,7 @@ def worker_service(name: str, queues: tuple[str, ...], concurrency: int) -> Serv
 def beat_service(settings: Settings) -> Service:
     """The clock that sends ticks."""
     command = (
-        *(sys.executable, "-m", "celery", "-A", "worker.app", "beat", "-l", "INFO"),
+        *(sys.executable, "-m", "celery", "-A", "worker.app", "beat", "-l", "WARNING"),
         *("--schedule", str(settings.state_dir / "beat-schedule"), "--pidfile="),
     )
     return Service("beat", command)

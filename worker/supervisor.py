@@ -26,11 +26,13 @@ from typing import IO
 import psutil
 from sqlalchemy import delete
 
+from rodif_core.errors import ValueOutOfRangeError
 from server.settings import Settings
 from server.store.session import Database
 from server.store.tables import ServiceBeat
 from worker import leash
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
+from worker.prepare import Prepared, prepare
 from worker.processes import (
     Service,
     broker_service,
@@ -65,8 +67,8 @@ class _Running:
 class System:
     """A started system; `running_system` makes it and takes it down."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
+    def __init__(self, settings: Settings, prepared: Prepared) -> None:
+        self.settings, self.prepared = settings, prepared
         host = "127.0.0.1" if settings.host in ("0.0.0.0", "::", "") else settings.host
         self.url = f"http://{host}:{settings.port}"
         self.failure: SystemStartError | None = None
@@ -218,19 +220,25 @@ def tail(log: Path, lines: int = LOG_TAIL_LINES) -> str:
 
 @contextlib.contextmanager
 def running_system(
-    settings: Settings, *, workers: int = 2, ready_seconds: float = 90.0
+    settings: Settings,
+    *,
+    workers: int = 2,
+    admin_password: str | None = None,
+    ready_seconds: float = 90.0,
 ) -> Iterator[System]:
-    """Start broker (unless it is elsewhere), API, workers and beat; yield when all are ready.
+    """Prepare the state folder, start everything, yield when all parts are ready, stop it all.
 
-    The database must be at head (see `worker.prepare`). `settings.port` 0 picks a free port; the
-    address is in `.url`, the settings in force in `.settings`. Logs lie in `<state_dir>/logs`.
-    Raises StateInUseError, SystemStartError or ServiceCrashedError; stops everything at the end.
+    Parts: broker (unless `settings.broker_url` names one elsewhere), API, a worker with `workers`
+    job children, tick worker, beat. `settings.port` 0 picks a free port; the address is in `.url`,
+    the settings in force in `.settings`, the admin account in `.prepared`. Logs lie in
+    `<state_dir>/logs`. Raises StateInUseError, SystemStartError or ServiceCrashedError.
     """
-    settings.state_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
-    (settings.state_dir / "logs").mkdir(exist_ok=True)
+    if workers < 1:
+        raise ValueOutOfRangeError("workers", workers, "at least 1")
+    (settings.state_dir / "logs").mkdir(parents=True, exist_ok=True)
     with _own_state(settings.state_dir):
         settings = settings.model_copy(update={"port": _free_port(settings)})
-        system = System(settings)
+        system = System(settings, prepare(settings, admin_password=admin_password))
         try:
             if socket_path(settings) is not None:
                 _forget_old_beats(settings)

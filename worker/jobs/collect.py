@@ -7,7 +7,7 @@ second attempt rolls out only the seeds that are missing, and two attempts store
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +47,11 @@ class CollectPlan:
         """Seeds of the job's episodes."""
         return range(self.seed, self.seed + self.episodes)
 
+    def batches(self) -> list[range]:
+        """The seeds in fixed portions: rounding in the network depends on the size of a batch, so
+        a second attempt makes the very same batches."""
+        return [self.seeds[i : i + BATCH] for i in range(0, self.episodes, BATCH)]
+
 
 def run(attempt: Attempt) -> None:
     """Do the job, or what is left of it."""
@@ -56,10 +61,11 @@ def run(attempt: Attempt) -> None:
         stored = {episode.seed for episode in _episodes(session, attempt, plan)}
     policy = load_checkpoint(attempt.bench.artifacts.get(checkpoint.artifact_sha256))
     attempt.progress("rollouts", len(stored) / plan.episodes)
-    for seeds in _batches([seed for seed in plan.seeds if seed not in stored]):
-        _store(attempt, plan, policy, seeds)
-        stored.update(seeds)
-        attempt.progress("rollouts", len(stored) / plan.episodes)
+    for seeds in plan.batches():
+        if not stored.issuperset(seeds):
+            _store(attempt, plan, policy, seeds, stored)
+            stored.update(seeds)
+            attempt.progress("rollouts", len(stored) / plan.episodes)
     with attempt.step() as session:
         episodes = _episodes(session, attempt, plan)
         pairs = _add_pairs(session, attempt, plan, episodes)
@@ -75,25 +81,17 @@ def run(attempt: Attempt) -> None:
         )
 
 
-def _batches(seeds: Sequence[int]) -> Iterator[list[int]]:
-    """Runs of consecutive seeds, at most BATCH long."""
-    batch: list[int] = []
-    for seed in seeds:
-        if batch and (seed != batch[-1] + 1 or len(batch) == BATCH):
-            yield batch
-            batch = []
-        batch.append(seed)
-    if batch:
-        yield batch
-
-
-def _store(attempt: Attempt, plan: CollectPlan, policy: Policy, seeds: list[int]) -> None:
-    trajectories = rollout(policy, RolloutConfig(episodes=len(seeds), seed=seeds[0]))
-    files = [attempt.bench.artifacts.put(trajectory.to_bytes()) for trajectory in trajectories]
+def _store(
+    attempt: Attempt, plan: CollectPlan, policy: Policy, seeds: range, stored: set[int]
+) -> None:
+    """Roll a whole batch out and store those of its episodes that are missing."""
+    trajectories = rollout(policy, RolloutConfig(episodes=len(seeds), seed=seeds.start))
+    missing = [item for item in zip(seeds, trajectories, strict=True) if item[0] not in stored]
+    files = [attempt.bench.artifacts.put(trajectory.to_bytes()) for _, trajectory in missing]
     with attempt.step() as session:
         session.add_all(
             _episode(attempt, plan, seed, trajectory, file)
-            for seed, trajectory, file in zip(seeds, trajectories, files, strict=True)
+            for (seed, trajectory), file in zip(missing, files, strict=True)
         )
 
 

@@ -1,0 +1,135 @@
+"""Make a state folder or a database ready to run: tables, admin account, shipped policies.
+
+Everything here can be done again without harm. Reading a checkpoint needs torch, which must not
+live in a process that starts others for days, so a child process does that, once per checkpoint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+from sqlalchemy import select
+
+from rodif_core.spec import TaskName
+from server.bootstrap import ensure_admin, register_checkpoint
+from server.campaigns import create_campaign
+from server.schemas.campaigns import CampaignSettings
+from server.settings import Settings
+from server.store.artifacts import ArtifactStore
+from server.store.migrate import upgrade
+from server.store.session import Database
+from server.store.tables import Annotator, Campaign, Checkpoint
+from worker.workbench import utc_now
+
+ADMIN = "admin"
+FIRST_CAMPAIGN = "avoid"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What `prepare` found or made."""
+
+    admin: str
+    password: str | None  # shown once: set when it was set now
+    campaigns: int
+
+
+def prepare(settings: Settings, *, admin_password: str | None = None) -> Prepared:
+    """Bring the database to head; ensure admin account, shipped checkpoints, a first campaign.
+
+    `admin_password` None keeps the present password, or makes a random one for a new account.
+    """
+    upgrade(settings.database_url)
+    database = Database(settings.database_url)
+    try:
+        with database.write() as session:
+            password = ensure_admin(
+                session, utc_now(), ADMIN, admin_password, cheap=settings.argon2_cheap
+            )
+        for task in TaskName:
+            register_shipped(settings, database, task)
+        return Prepared(ADMIN, password, _ensure_campaign(database))
+    finally:
+        database.dispose()
+
+
+def shipped_bytes(task: TaskName) -> bytes:
+    """The pretrained checkpoint that comes with the package, read without torch."""
+    return (resources.files("rodif_core") / "checkpoints" / f"{task}.safetensors").read_bytes()
+
+
+def register_shipped(settings: Settings, database: Database, task: TaskName) -> int:
+    """Make the shipped checkpoint of a task known to the database; returns its id."""
+    blob = shipped_bytes(task)
+    sha256 = hashlib.sha256(blob).hexdigest()
+    known = select(Checkpoint.id).where(Checkpoint.artifact_sha256 == sha256)
+    assert settings.artifact_dir is not None
+    store = ArtifactStore(settings.artifact_dir)
+    with database.read() as session:
+        found = session.scalars(known).first()
+    if found is not None and store.exists(sha256):
+        return found
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        facts = pool.submit(checkpoint_facts, blob).result()
+    store.put(blob)
+    with database.write() as session:
+        checkpoint = register_checkpoint(
+            session,
+            utc_now(),
+            store,
+            task=task.value,
+            name=f"{task}-pretrained-{facts['digest'][:8]}",
+            blob=blob,
+            code_version=importlib.metadata.version("rodif-studio"),
+            **facts,
+        )
+        return checkpoint.id
+
+
+def checkpoint_facts(blob: bytes) -> dict[str, Any]:
+    """Digest, configuration and measurements of a checkpoint file; imports torch and mujoco."""
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.tasks import get_task
+
+    checkpoint = load_checkpoint(blob)
+    task = get_task(checkpoint.task)
+    task_facts = {
+        "modes": list(task.modes),
+        "groups": list(task.groups),
+        "preferred_group": task.preferred_group,
+        "criterion": task.criterion,
+        "scene": task.scene_shapes(),
+        "control_dt": task.control_dt,
+        "max_steps": task.max_steps,
+    }
+    return {
+        "digest": checkpoint.digest,
+        "config": checkpoint.policy.config.to_json() | {"task_facts": task_facts},
+        "metrics": checkpoint.card,
+    }
+
+
+def _ensure_campaign(database: Database) -> int:
+    """A first campaign on Avoid when there is none; returns how many there are."""
+    with database.write() as session:
+        present = len(session.scalars(select(Campaign.id)).all())
+        if present:
+            return present
+        admin = session.scalars(select(Annotator).where(Annotator.name == ADMIN)).one()
+        create_campaign(
+            session,
+            utc_now(),
+            name=FIRST_CAMPAIGN,
+            task=TaskName.AVOID,
+            criterion=None,
+            start_checkpoint_id=None,
+            settings=CampaignSettings().model_dump(mode="json"),
+            by=admin.id,
+        )
+        return 1
