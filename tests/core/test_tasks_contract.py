@@ -33,7 +33,9 @@ def actions_of(task: Task, seeds: Sequence[int], steps: int = STEPS) -> NDArray[
     return np.asarray(task.action_limit * np.stack(columns, axis=1), dtype=np.float32)
 
 
-def play(env: BatchEnv, contexts: Sequence[dict[str, Any]], actions: NDArray[Any]) -> dict[str, Any]:
+def play(
+    env: BatchEnv, contexts: Sequence[dict[str, Any]], actions: NDArray[Any]
+) -> dict[str, Any]:
     """Everything that an environment hands out, after every step."""
     rows = {"observations": [env.reset(contexts)], "qpos": [env.qpos], "paths": [env.paths]}
     for action in actions:
