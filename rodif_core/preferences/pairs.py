@@ -58,16 +58,8 @@ def choose_pairs(
 
     Raises UnknownNameError, ValueOutOfRangeError (more pairs than exist, share outside [0, 1]).
     """
-    if strategy not in STRATEGIES:
-        raise UnknownNameError("pair strategy", strategy, STRATEGIES)
-    if not 0 <= random_share <= 1:
-        raise ValueOutOfRangeError("random_share", random_share, "in [0, 1]")
+    _check(len(groups), count, strategy, random_share)
     n = len(groups)
-    possible = n * (n - 1) // 2
-    if not 0 <= count <= possible:
-        raise ValueOutOfRangeError(
-            "count", count, f"0 … {possible}, the number of pairs of {n} trajectories"
-        )
     members = [[i for i in range(n) if groups[i] == name] for name in sorted(set(groups), key=str)]
     across = list(combinations(range(len(members)), 2))
     picked_across = [0] * len(across)
@@ -97,6 +89,18 @@ def choose_pairs(
     while len(chosen) < count:
         take(everyone, everyone, RANDOM)
     return [chosen[i] for i in rng.permutation(len(chosen))]
+
+
+def _check(n: int, count: int, strategy: str, random_share: float) -> None:
+    if strategy not in STRATEGIES:
+        raise UnknownNameError("pair strategy", strategy, STRATEGIES)
+    if not 0 <= random_share <= 1:
+        raise ValueOutOfRangeError("random_share", random_share, "in [0, 1]")
+    possible = n * (n - 1) // 2
+    if not 0 <= count <= possible:
+        raise ValueOutOfRangeError(
+            "count", count, f"0 … {possible}, the number of pairs of {n} trajectories"
+        )
 
 
 def _least_used_pair(

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Row = Mapping[str, Any]
-FIELDS = tuple(
-    "method corruption labels design seed success alignment alignment_of_successes off_support"
-    " n updates checkpoint".split()
-)
+FIELDS = {
+    *("method", "corruption", "labels", "design", "seed", "updates", "checkpoint"),
+    *("success", "alignment", "alignment_of_successes", "off_support", "n"),
+}
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -38,8 +38,8 @@ def read_rows(path: Path) -> list[Row]:
         rows = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise RodifError(f"{path} is not a benchmark's JSON file: {error}") from error
-    if not isinstance(rows, list) or any(set(FIELDS) - set(row) for row in rows):
-        raise RodifError(f"{path} is not a list of benchmark rows with {', '.join(FIELDS)}")
+    if not isinstance(rows, list) or any(FIELDS - set(row) for row in rows):
+        raise RodifError(f"{path} is not a list of benchmark rows with {', '.join(sorted(FIELDS))}")
     return rows
 
 
