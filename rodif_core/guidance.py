@@ -25,6 +25,11 @@ Progress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
 REPORT_EVERY = 10  # updates between reports
 
 
+def guidance_target(anchor: Tensor, noise: Tensor, scale: float) -> Tensor:
+    """ε_ref + s (ε - ε_ref): the reference's own prediction at s = 0, plain imitation at s = 1."""
+    return anchor + scale * (noise - anchor)
+
+
 def guide(
     reference: DiffusionPolicy,
     histories: Tensor,
@@ -55,16 +60,18 @@ def guide(
         noisy = add_noise(reference.schedule, chunks[pick], noise, k)
         with torch.no_grad():
             anchor = reference.denoiser(noisy, k, histories[pick])
-            target = anchor + scale * (noise - anchor)
+            target = guidance_target(anchor, noise, scale)
         loss = F.mse_loss(policy.denoiser(noisy, k, histories[pick]), target)
-        if not math.isfinite(float(loss)):
-            raise LearningError(f"the guidance loss became {float(loss)} at update {update}")
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise LearningError(f"the guidance loss became {value} at update {update}")
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
         with torch.no_grad():
-            for mean, value in zip(average.parameters(), policy.denoiser.parameters(), strict=True):
-                mean.lerp_(value, 1 - config.ema_decay)
+            pairs = zip(average.parameters(), policy.denoiser.parameters(), strict=True)
+            for mean, current in pairs:
+                mean.lerp_(current, 1 - config.ema_decay)
         if progress is not None and (update % REPORT_EVERY == 0 or update == config.updates - 1):
-            progress(update + 1, config.updates, {"loss": float(loss)})
+            progress(update + 1, config.updates, {"loss": value})
     return DiffusionPolicy(policy.config, average, policy.schedule, policy.normaliser)

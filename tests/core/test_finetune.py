@@ -1,0 +1,194 @@
+"""Scoring, guidance and the two fine-tuners, on hand-made chains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rodif_core.contrast import contrast
+from rodif_core.errors import LearningError
+from rodif_core.finetune import finetune
+from rodif_core.guidance import guidance_target, guide
+from rodif_core.guided import Trial, choose
+from rodif_core.log_ratio import PairMatrix, Transitions
+from rodif_core.preferences.pairs import Preference
+from rodif_core.scoring import PathUtility, path_features, split_threshold, standardise
+from rodif_core.spec import FinetuneConfig, FinetuneMethod, GuideConfig
+from tests.core.learning import chain_trajectory, tiny_checkpoint, tiny_policy
+
+RODIF = FinetuneConfig(
+    method=FinetuneMethod.RODIF, conservativeness=0.3, updates=6, learning_rate=1e-3, chunk_rows=64
+)
+CROSS = [Preference(w, l) for w in range(3) for l in range(3, 6)]  # noqa: E741
+
+
+def labelled_trajectories() -> list:
+    """Three winners on the left, three losers on the right."""
+    policy = tiny_policy()
+    sides = [0.4] * 3 + [0.6] * 3
+    return [chain_trajectory(policy, 3, seed=i, x=x + 0.01 * i) for i, x in enumerate(sides)]
+
+
+@pytest.mark.parametrize("method", [FinetuneMethod.RODIF, FinetuneMethod.DP_DPO])
+def test_literal_fine_tuner_raises_the_mean_vote(method: FinetuneMethod) -> None:
+    config = replace(RODIF, method=method)
+    report = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config).report
+    votes = [point["mean_vote"] for point in report["curve"]]
+    assert votes[0] == 0.5
+    assert votes[-1] > 0.55
+    assert report["kl_winners"] > 0
+
+
+def test_equal_arguments_give_equal_weights() -> None:
+    results = [
+        finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF).checkpoint.digest
+        for _ in range(2)
+    ]
+    assert results[0] == results[1]
+
+
+def test_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    whole = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF)
+
+    class KilledError(Exception):
+        pass
+
+    def kill(_stage: str, fraction: float, _metrics: dict[str, float]) -> None:
+        if fraction > 0.9:
+            raise KilledError
+
+    arguments = (tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF)
+    with pytest.raises(KilledError):
+        finetune(*arguments, workspace=tmp_path, progress=kill)
+    assert list(tmp_path.iterdir()), "the partial state was written"
+    resumed = finetune(*arguments, workspace=tmp_path)
+    assert resumed.checkpoint.digest == whole.checkpoint.digest
+    assert resumed.report["curve"] == whole.report["curve"]
+
+
+def test_optimizer_stops_when_the_gate_shuts() -> None:
+    config = replace(RODIF, conservativeness=0.45, updates=200)
+    report = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config).report
+    assert report["stopped"].startswith("the gate shut at update")
+    assert len(report["curve"]) < 200
+
+
+def test_dead_gradient_is_reported_and_trains_nothing() -> None:
+    config = replace(RODIF, conservativeness=0.9)
+    parent = tiny_checkpoint()
+    policy = parent.policy
+    trajectories = labelled_trajectories()
+    transitions = Transitions.collect(policy, trajectories, config.chunk_rows)
+    matrix = PairMatrix.build(transitions, CROSS * 10, config)
+    result = contrast(policy, transitions, matrix, config, stage="rodif")
+    assert "dead gradient" in result.stopped
+    assert "below 0.5" in result.stopped
+    assert result.curve == []
+    for after, before in zip(
+        result.policy.denoiser.parameters(), policy.denoiser.parameters(), strict=True
+    ):
+        assert torch.equal(after, before)
+
+
+def test_missing_conservativeness_is_refused() -> None:
+    with pytest.raises(LearningError, match="estimate it from the labels"):
+        finetune(
+            tiny_checkpoint(), labelled_trajectories(), CROSS, replace(RODIF, conservativeness=None)
+        )
+
+
+def test_preference_outside_the_trajectories_is_named() -> None:
+    with pytest.raises(LearningError, match=r"winner=7.*0 … 5"):
+        finetune(tiny_checkpoint(), labelled_trajectories(), [Preference(7, 0)], RODIF)
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(0.0, 0.2), (1.0, 1.0), (2.0, 1.8), (3.0, 2.6)])
+def test_guidance_target_matches_hand_worked_number(scale: float, expected: float) -> None:
+    # ε_ref = 0.2, ε = 1: the reference is off by 0.8, and s times that is added to it.
+    target = guidance_target(torch.tensor([0.2]), torch.tensor([1.0]), scale)
+    assert float(target) == pytest.approx(expected)
+
+
+def test_guidance_lowers_the_denoising_error_on_the_kept_decisions() -> None:
+    policy = tiny_policy()
+    generator = torch.Generator().manual_seed(0)
+    histories = policy.normaliser.observation(torch.zeros(8, 2, 4))
+    chunks = torch.full((8, 8, 2), 0.5)
+    config = GuideConfig(updates=400, batch_size=64, learning_rate=5e-3, ema_decay=0.9)
+    moved = guide(policy, histories, chunks, 1.0, config, seed=0)
+    noise = torch.randn(64, 5, 8, 2, generator=generator)
+    before = policy.act(torch.full((64, 2, 4), 0.0), noise)[1][:, -1]
+    after = moved.act(torch.full((64, 2, 4), 0.0), noise)[1][:, -1]
+    assert (after - 0.5).abs().mean() < 0.7 * (before - 0.5).abs().mean()
+
+
+def test_guidance_without_winners_says_what_to_do() -> None:
+    with pytest.raises(LearningError, match="more labels are needed"):
+        guide(tiny_policy(), torch.zeros(0, 2, 4), torch.zeros(0, 8, 2), 2.0, GuideConfig(), 0)
+
+
+def test_path_utility_of_two_paths_matches_hand_worked_number() -> None:
+    # Two far-apart paths have an (almost) diagonal prior. With n labels for the first, the mode
+    # is symmetric, u_0 = -u_1 = u, and solves u = n (1 - σ(2u)) / (1 + off-diagonal terms);
+    # the median distance is the length scale, so the kernel's off-diagonal is exp(-1/2).
+    features = np.array([[0.0, 0.0], [3.0, 4.0]])
+    fit = PathUtility.fit(features, [Preference(0, 1)] * 4)
+    rho = np.exp(-0.5)
+    u = fit.utilities[0]
+    assert fit.utilities[1] == pytest.approx(-u)
+    # K⁻¹ (u, -u) = (u, -u) / (1 - rho), hence u / (1 - rho) = 4 (1 - σ(2u)).
+    assert u / (1 - rho + 1e-6) == pytest.approx(4 * (1 - 1 / (1 + np.exp(-2 * u))), rel=1e-4)
+    assert fit.predict(features) == pytest.approx(fit.utilities, abs=1e-4)
+
+
+def test_path_utility_recovers_the_side_from_sparse_noisy_labels() -> None:
+    rng = np.random.default_rng(0)
+    policy = tiny_policy()
+    sides = [0.4 if i < 12 else 0.6 for i in range(24)]
+    trajectories = [
+        chain_trajectory(policy, 1, seed=i, x=x + rng.normal(0, 0.02)) for i, x in enumerate(sides)
+    ]
+    preferences = []
+    for _ in range(60):
+        winner, loser = int(rng.integers(12)), int(rng.integers(12, 24))
+        if rng.random() < 0.3:
+            winner, loser = loser, winner
+        preferences.append(Preference(winner, loser))
+    utilities = PathUtility.fit(path_features(trajectories), preferences).utilities
+    above = utilities > split_threshold(utilities)
+    assert (above == np.array([x < 0.5 for x in sides])).mean() > 0.9
+
+
+def test_split_threshold_does_not_depend_on_the_share_of_good_ones() -> None:
+    scores = np.array([0.0, 0.1, 0.2, 5.0, 0.05, 0.15, 0.12, 0.11])
+    assert 0.2 < split_threshold(scores) < 5.0
+    assert split_threshold(scores) == pytest.approx(2.6)
+
+
+def test_split_of_equal_scores_is_refused() -> None:
+    with pytest.raises(LearningError, match="do not separate"):
+        split_threshold(np.ones(4))
+
+
+def test_standardise_gives_zeros_when_scores_do_not_differ() -> None:
+    assert np.array_equal(standardise(np.ones(3)), np.zeros(3))
+
+
+def trial(scale: float, success: float, off: float, predicted: float) -> Trial:
+    return Trial(scale, tiny_policy(), success, off, predicted)
+
+
+def test_choice_prefers_what_labels_predict_among_sound_scales() -> None:
+    base = trial(0.0, 0.9, 0.02, 0.2)
+    trials = [trial(1.0, 0.95, 0.02, 0.6), trial(2.0, 0.94, 0.03, 0.9), trial(3.0, 0.9, 0.2, 1.0)]
+    assert choose(base, trials).scale == 2.0
+
+
+def test_choice_takes_the_least_harm_when_no_scale_is_sound() -> None:
+    base = trial(0.0, 0.9, 0.02, 0.2)
+    trials = [trial(1.0, 0.5, 0.3, 0.9), trial(2.0, 0.8, 0.1, 0.4)]
+    assert choose(base, trials).scale == 2.0

@@ -1,0 +1,90 @@
+"""Configurations: round trip through JSON, clear errors."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.spec import FinetuneConfig, GuideConfig, RolloutConfig, TaskName, parse_name
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        FinetuneConfig(),
+        FinetuneConfig(conservativeness=0.4, guide=GuideConfig(scales=(2.0,))),
+        RolloutConfig(7, 3),
+    ],
+)
+def test_config_survives_json(config: FinetuneConfig | RolloutConfig) -> None:
+    assert type(config).from_json(json.loads(json.dumps(config.to_json()))) == config
+
+
+@pytest.mark.parametrize("gamma", [-0.01, 1.0, 2.0, math.nan, math.inf])
+def test_gamma_outside_its_range_names_value_and_range(gamma: float) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=r"conservativeness is .*in \[0, 1\)"):
+        FinetuneConfig(conservativeness=gamma)
+
+
+def test_unknown_method_lists_the_legal_ones() -> None:
+    with pytest.raises(UnknownNameError, match="'ppo'.*'rodif_guided', 'rodif', 'dp_dpo'"):
+        FinetuneConfig.from_json({"method": "ppo"})
+
+
+def test_unknown_task_lists_the_legal_ones() -> None:
+    with pytest.raises(UnknownNameError, match="'juggling'.*'avoid'"):
+        parse_name(TaskName, "juggling", "task")
+
+
+def test_unknown_field_lists_the_legal_ones() -> None:
+    with pytest.raises(UnknownNameError, match="'gamma'.*'conservativeness'"):
+        FinetuneConfig.from_json({"gamma": 0.3})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("kl_coef", 0.0),
+        ("vote_temperature", -1.0),
+        ("outer_temperature", math.inf),
+        ("vote_scale", 0.0),
+        ("learning_rate", 0.0),
+        ("updates", 0),
+        ("chunk_rows", 0),
+        ("group_size", 0),
+        ("seed", -1),
+        ("matched_state_scale", 0.0),
+    ],
+)
+def test_finetune_value_out_of_range_is_named(field: str, value: float) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=field):
+        FinetuneConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("scales", ()),
+        ("scales", (0.0,)),
+        ("score_updates", 0),
+        ("updates", 0),
+        ("learning_rate", 2.0),
+        ("batch_size", 0),
+        ("ema_decay", 1.0),
+        ("selection_rollouts", 1),
+        ("self_training_rounds", 9),
+        ("self_training_rollouts", 1),
+    ],
+)
+def test_guide_value_out_of_range_is_named(field: str, value: object) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=field):
+        GuideConfig(**{field: value})
+
+
+@pytest.mark.parametrize(("field", "value"), [("episodes", 0), ("seed", -1), ("max_parallel", 0)])
+def test_rollout_value_out_of_range_is_named(field: str, value: int) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=field):
+        RolloutConfig(**{field: value})
