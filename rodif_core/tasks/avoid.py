@@ -137,7 +137,7 @@ class AvoidTask(Task):
             (x >= MIN_X) & (x <= MAX_X) & (y >= MIN_Y) & (reach >= MIN_REACH) & (reach <= MAX_REACH)
         )
 
-    def outcome(self, path: Array, reason: str) -> dict[str, Any]:
+    def outcome(self, path: NDArray[np.floating[Any]], reason: str) -> dict[str, Any]:
         if reason not in REASONS:
             raise UnknownNameError("reason", reason, REASONS)
         gaps = passed_gaps(path)
@@ -164,7 +164,7 @@ class AvoidTask(Task):
         ]
 
 
-def passed_gaps(path: Array) -> tuple[int | None, int | None, int | None]:
+def passed_gaps(path: NDArray[np.floating[Any]]) -> tuple[int | None, int | None, int | None]:
     """Which gap of each row a path (N + 1, at least 2) took, from 1 at the left; None: not reached.
 
     D3IL's rule: the row's gap is given by x at the first control step with |y - row| <= 3 cm, in

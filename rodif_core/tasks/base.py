@@ -76,7 +76,7 @@ class Task(ABC):
         """Which simulations (m,) are within the workspace limits."""
 
     @abstractmethod
-    def outcome(self, path: Array, reason: str) -> dict[str, Any]:
+    def outcome(self, path: NDArray[np.floating[Any]], reason: str) -> dict[str, Any]:
         """Outcome of an episode with end positions `path` (N + 1, 3) that ended for `reason`.
 
         {"success": bool, "mode": str | None, "group": str | None, "reason": str}. The mode is None

@@ -15,7 +15,7 @@ Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
 
 
-class GymEnv(gymnasium.Env[Observation, Action]):  # type: ignore[misc]  # untyped to mypy
+class GymEnv(gymnasium.Env[Observation, Action]):
     """Reward 1 for the control step that reaches the goal, else 0.
 
     `reset(seed=…)` draws the start from the seed; `options={"context": {…}}` sets it. The info of

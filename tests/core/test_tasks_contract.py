@@ -46,8 +46,8 @@ def play(
 
 
 def assert_same_bits(first: dict[str, Any], second: dict[str, Any]) -> None:
-    for name in first:
-        assert first[name].tobytes() == second[name].tobytes(), name
+    for name, values in first.items():
+        assert values.tobytes() == second[name].tobytes(), name
 
 
 def test_observations_are_finite_and_of_the_promised_size(task: Task) -> None:
