@@ -1,0 +1,127 @@
+"""Rolling out a policy in the real simulation, and summing it up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from rodif_core.drift import fit_support, nearest_distance, off_support_share, visited_states
+from rodif_core.evaluate import evaluate, thin_path
+from rodif_core.gate import judge
+from rodif_core.intervals import wilson_interval
+from rodif_core.rollout import rollout
+from rodif_core.spec import RolloutConfig
+from rodif_core.trajectory import Trajectory
+from tests.core.learning import tiny_checkpoint
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[Trajectory]:
+    return rollout(tiny_checkpoint(), RolloutConfig(episodes=5, seed=40))
+
+
+def test_same_seeds_give_the_same_bits(episodes: list[Trajectory]) -> None:
+    again = rollout(tiny_checkpoint(), RolloutConfig(episodes=5, seed=40))
+    assert [t.to_bytes() for t in again] == [t.to_bytes() for t in episodes]
+
+
+def test_episode_depends_on_its_own_seed_only(episodes: list[Trajectory]) -> None:
+    other = rollout(tiny_checkpoint(), RolloutConfig(episodes=2, seed=43))
+    for mine, same in zip(other, episodes[3:], strict=True):
+        assert mine.context == same.context
+        # The network's last bits may depend on how many rows it sees; behaviour must not.
+        assert np.allclose(mine.chains[0], same.chains[0], atol=1e-4)
+
+
+def test_different_seeds_give_different_noise(episodes: list[Trajectory]) -> None:
+    assert not np.array_equal(episodes[0].chains[0, 0], episodes[1].chains[0, 0])
+
+
+def test_recorded_actions_are_the_executed_part_of_the_chains(
+    episodes: list[Trajectory],
+) -> None:
+    policy = tiny_checkpoint().policy
+    size = policy.config
+    for episode in episodes:
+        chunks = policy.normaliser.to_task_action(
+            torch.tensor(episode.chains[:, -1, : size.executed_steps])
+        )
+        planned = chunks.reshape(-1, size.action_dim).numpy()[: len(episode.actions)]
+        assert np.allclose(episode.actions, planned.clip(-0.0125, 0.0125), atol=1e-7)
+        assert episode.chains.shape[1:] == (size.denoising_steps + 1, size.predicted_steps, 2)
+
+
+def test_recorded_history_is_what_the_policy_saw(episodes: list[Trajectory]) -> None:
+    for episode in episodes:
+        for history, step in zip(episode.histories, episode.decision_steps, strict=True):
+            assert np.array_equal(history[-1], episode.observations[step])
+            assert np.array_equal(history[0], episode.observations[max(step - 1, 0)])
+
+
+def test_evaluation_counts_every_episode_once() -> None:
+    facts = evaluate(tiny_checkpoint(), RolloutConfig(episodes=6, seed=3)).to_json()
+    assert facts["n"] == 6 == sum(facts["groups"].values()) == sum(facts["reasons"].values())
+    assert 0 <= facts["alignment"] <= facts["success"] <= 1
+    low, high = facts["intervals"]["success"]
+    assert low <= facts["success"] <= high
+    assert len(facts["paths"]) == len(facts["path_groups"]) == 6
+
+
+def test_thin_path_keeps_both_ends(episodes: list[Trajectory]) -> None:
+    points = thin_path(episodes[0], 8)
+    assert len(points) == 8
+    assert points[0] == pytest.approx(episodes[0].paths[0].tolist(), abs=1e-4)
+    assert points[-1] == pytest.approx(episodes[0].paths[-1].tolist(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("successes", "n", "expected"),
+    # Wilson (1927) intervals, worked with z = 1.96: 8 of 10, 0 of 10, and nothing observed.
+    [(8, 10, (0.4902, 0.9433)), (0, 10, (0.0, 0.2775)), (0, 0, (0.0, 1.0))],
+)
+def test_wilson_interval_matches_known_numbers(
+    successes: int, n: int, expected: tuple[float, float]
+) -> None:
+    assert wilson_interval(successes, n) == pytest.approx(expected, abs=1e-4)
+
+
+def test_support_keeps_rare_places_and_takes_the_99th_percentile() -> None:
+    crowd, rare = torch.zeros(500, 2), torch.tensor([[1.0, 1.0]])
+    held_out = torch.tensor([[0.0, i / 1000] for i in range(101)])
+    support = fit_support(torch.cat([crowd, rare]), held_out)
+    assert len(support.points) == 2
+    assert support.threshold == pytest.approx(0.099, abs=1e-6)
+    assert float(nearest_distance(support.points, rare)[0]) == 0.0
+
+
+def test_off_support_share_is_zero_on_the_support_and_rises_away_from_it(
+    episodes: list[Trajectory],
+) -> None:
+    normaliser = tiny_checkpoint().policy.normaliser
+    states = visited_states(episodes, normaliser)
+    near = fit_support(states, states + 0.01)
+    assert off_support_share(episodes, normaliser, near) == 0.0
+    far = fit_support(states + 10, states + 10.01)
+    assert off_support_share(episodes, normaliser, far) == 1.0
+
+
+def facts(success: float, off: float, upper: float | None = None) -> dict:
+    interval = [0.0, upper if upper is not None else min(1.0, success + 0.05)]
+    return {"success": success, "off_support": off, "n": 200, "intervals": {"success": interval}}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "passes"),
+    [
+        (facts(0.9, 0.02), facts(0.95, 0.02), True),
+        (facts(0.9, 0.02), facts(0.87, 0.04), True),
+        (facts(0.9, 0.02), facts(0.84, 0.02), False),  # fell by more than 5 points
+        (facts(0.9, 0.02), facts(0.88, 0.02, upper=0.89), False),  # surely fell
+        (facts(0.9, 0.02), facts(0.95, 0.06), False),  # left the data
+    ],
+)
+def test_gate_refuses_lost_success_and_drift(before: dict, after: dict, passes: bool) -> None:
+    verdict = judge(before, after)
+    assert verdict.passed is passes
+    assert len(verdict.reasons) == 2
