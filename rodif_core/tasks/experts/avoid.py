@@ -31,7 +31,7 @@ OUTER_EARLY = 0.02  # m of y: paths around the last row get out that much before
 SLOPE = 0.4  # of the slope between the neighbours: how early a path turns to its next gap
 MIN_CLEARANCE = 0.008  # m between rod and cylinder, everywhere on the path
 MAX_DRAWS = 200  # of one path; measured: the hardest modes need about 1
-LOOK_AHEAD = 0.03  # m of y
+LOOK_AHEAD = 0.03  # m along the path
 SPEEDS = (0.0088, 0.0116)  # m per control step, a draw per episode; D3IL's stick was at 0.0125
 TREMBLE = 0.0008  # m per control step: standard deviation of the hand's noise on each axis
 TREMBLE_MEMORY = 0.8  # share of the noise that stays from one control step to the next
@@ -109,8 +109,11 @@ class AvoidExpert:
     def act(self, observation: NDArray[np.float32]) -> Array:
         """The steady hand's action (2,) in metres for an observation (4,)."""
         setpoint = np.asarray(observation[:2], dtype=np.float64)
-        ahead = setpoint[1] + LOOK_AHEAD
-        direction = np.array([float(self.x(ahead)) - setpoint[0], LOOK_AHEAD])
+        below, above = self.x(np.array([setpoint[1] - 1e-3, setpoint[1] + 1e-3]))
+        slope = (above - below) / 2e-3
+        # Measured along the path: a look-ahead in y alone would cut the corners of steep paths.
+        rise = LOOK_AHEAD / np.sqrt(1.0 + slope**2)
+        direction = np.array([float(self.x(setpoint[1] + rise)) - setpoint[0], rise])
         return np.asarray(self.speed * direction / np.hypot(*direction))
 
     def to_json(self) -> dict[str, Any]:
