@@ -88,6 +88,14 @@ class System:
         names = ", ".join(repr(running.service.name) for running in self._services)
         raise SystemStartError(f"no running service {name!r}; services are {names}")
 
+    def runs(self, name: str) -> bool:
+        """Whether a service runs now."""
+        try:
+            self.pid(name)
+        except SystemStartError:
+            return False
+        return True
+
     def wait(self) -> None:
         """Block until the system ends; raises ServiceCrashedError when it gave up."""
         while not self._ended.wait(timeout=0.5):
@@ -118,13 +126,18 @@ class System:
                 )
             time.sleep(POLL_SECONDS)
 
-    def _start(self, service: Service) -> None:
+    def start(self, service: Service) -> None:
+        """Start one service of the tree, with a log file of its name."""
         log = self.settings.state_dir / "logs" / f"{service.name}.log"
         if log.exists() and log.stat().st_size > LOG_BYTES_KEPT:
             log.replace(log.with_suffix(".log.1"))
         running = _Running(service, log)
         self._services.append(running)
         self._launch(running)
+
+    def watch(self) -> None:
+        """From now on restart what dies."""
+        self._monitor.start()
 
     def _launch(self, running: _Running) -> None:
         service = running.service
@@ -244,8 +257,8 @@ def running_system(
                 _forget_old_beats(settings)
                 _start_broker(system)
             for service in embedded_services(settings, workers):
-                system._start(service)
-            system._monitor.start()
+                system.start(service)
+            system.watch()
             system.wait_until_ready(ready_seconds)
             yield system
         finally:
@@ -300,15 +313,13 @@ def _start_broker(system: System) -> None:
     folder.mkdir(exist_ok=True)
     end_orphan_broker(folder / "valkey.pid")
     path.unlink(missing_ok=True)
-    system._start(broker_service(system.settings))
-    running = system._services[-1]
+    service = broker_service(system.settings)
+    system.start(service)
     deadline = time.monotonic() + BROKER_SECONDS
     while not broker_answers(path):
-        assert running.process is not None
-        if running.process.poll() is not None or time.monotonic() > deadline:
-            raise SystemStartError(
-                f"the broker does not start; the end of {running.log}:\n{tail(running.log)}"
-            )
+        if not system.runs(service.name) or time.monotonic() > deadline:
+            log = system.settings.state_dir / "logs" / f"{service.name}.log"
+            raise SystemStartError(f"the broker does not start; the end of {log}:\n{tail(log)}")
         time.sleep(0.02)
 
 

@@ -1,4 +1,4 @@
-"""Finetune, evaluate and publish jobs: a whole round, deliveries twice, refusals, reproducibility."""
+"""Finetune, evaluate and publish jobs: a whole round, delivered twice, refused, repeated."""
 
 from __future__ import annotations
 
