@@ -8,15 +8,21 @@ from datetime import UTC, datetime
 
 from fastapi import FastAPI
 
-from server.api import errors, health
+from server import pages
+from server.api import accounts, campaigns, errors, events, health, labels, rounds
+from server.api.guards import SameOriginGuard
 from server.api.services import Services
 from server.queue import SendJob, make_sender
+from server.schemas.common import Problem
 from server.settings import Settings
 from server.store.artifacts import ArtifactStore
 from server.store.migrate import check_at_head
 from server.store.session import Database
 
 API_PREFIX = "/api/v1"
+VERSION = "0.1.0"
+MAX_BODY_BYTES = 2 * 1024 * 1024  # far above any legal request
+PROBLEM_STATUSES = (400, 401, 403, 404, 409, 413, 422, 429)  # any endpoint may answer these
 
 
 def _utc_now() -> datetime:
@@ -42,7 +48,16 @@ def create_app(
         yield
         database.dispose()
 
-    app = FastAPI(title="RoDiF Studio", version="0.1.0", lifespan=lifespan)
+    app = FastAPI(
+        title="RoDiF Studio",
+        version=VERSION,
+        lifespan=lifespan,
+        max_body_size=MAX_BODY_BYTES,
+        openapi_url=f"{API_PREFIX}/openapi.json",
+        docs_url=None,  # the usual pages load scripts from other hosts; docs/api.md stands in
+        redoc_url=None,
+        responses={code: {"model": Problem} for code in PROBLEM_STATUSES},
+    )
     app.state.services = Services(
         settings=settings,
         database=database,
@@ -50,5 +65,8 @@ def create_app(
         clock=clock or _utc_now,
     )
     errors.install(app)
-    app.include_router(health.router, prefix=API_PREFIX)
+    for module in (accounts, campaigns, labels, rounds, events, health):
+        app.include_router(module.router, prefix=API_PREFIX)
+    pages.install(app)
+    app.add_middleware(SameOriginGuard)
     return app

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 
 from fastapi import Request
 
@@ -21,6 +21,11 @@ class Services:
     database: Database
     artifacts: ArtifactStore
     clock: Callable[[], datetime]
+
+    @property
+    def lease_for(self) -> timedelta:
+        """How long a pair is handed out."""
+        return timedelta(seconds=self.settings.lease_seconds)
 
 
 def services_of(request: Request) -> Services:

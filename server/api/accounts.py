@@ -1,0 +1,175 @@
+"""Signing in and out, accounts, tokens."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response, status
+
+from server import accounts, sign_in
+from server.api.access import COOKIE, Admin, Anyone, ReadSession, UseServices, WriteSession
+from server.api.params import PathId
+from server.errors import NotAllowedError
+from server.schemas.accounts import (
+    AnnotatorCreate,
+    AnnotatorOut,
+    AnnotatorPatch,
+    MeOut,
+    SessionCreate,
+    SessionOut,
+    TokenCreate,
+    TokenIssued,
+    TokenOut,
+)
+from server.sign_in import Me
+from server.states import Role
+from server.store.tables import Annotator
+
+router = APIRouter(tags=["accounts"])
+
+
+@router.post("/session")
+def open_session(
+    body: SessionCreate, request: Request, response: Response, services: UseServices
+) -> SessionOut:
+    """Sign in; the answer sets the session cookie."""
+    now, settings = services.clock(), services.settings
+    address = request.client.host if request.client else "unknown"
+    # Three short transactions: the failure must be stored although the answer is an error, and
+    # no writer may wait for the slow hash.
+    with services.database.write() as session:
+        sign_in.note_attempt(session, now, name=body.name, address=address)
+    with services.database.read() as session:
+        me = sign_in.check_password(session, body.name, body.password, cheap=settings.argon2_cheap)
+    lifetime = timedelta(hours=settings.session_hours)
+    with services.database.write() as session:
+        secret = sign_in.open_session(session, now, me, lifetime=lifetime)
+    response.set_cookie(
+        COOKIE,
+        secret,
+        max_age=int(lifetime.total_seconds()),
+        httponly=True,
+        samesite="lax",
+        secure=settings.secure_cookies,
+    )
+    return SessionOut(annotator=MeOut.model_validate(me))
+
+
+@router.delete("/session", status_code=status.HTTP_204_NO_CONTENT)
+def close_session(request: Request, response: Response, services: UseServices) -> None:
+    """Sign out: revoke the session of the cookie. Without one there is nothing to do."""
+    secret = request.cookies.get(COOKIE)
+    if secret is not None:
+        with services.database.write() as session:
+            sign_in.close_session(session, services.clock(), secret)
+    response.delete_cookie(COOKIE)
+
+
+@router.get("/me")
+def me(me: Anyone) -> MeOut:
+    """The signed-in account."""
+    return MeOut.model_validate(me)
+
+
+def _out(account: Annotator, labels: int) -> AnnotatorOut:
+    return AnnotatorOut(
+        id=account.id,
+        name=account.name,
+        role=Role(account.role),
+        kind=sign_in.me_of(account).kind,
+        active=account.active,
+        created_at=account.created_at,
+        labels=labels,
+    )
+
+
+@router.get("/annotators")
+def list_annotators(_me: Admin, session: ReadSession) -> list[AnnotatorOut]:
+    """All accounts."""
+    labels = accounts.labels_per_annotator(session)
+    return [_out(row, labels.get(row.id, 0)) for row in accounts.list_annotators(session)]
+
+
+@router.post("/annotators", status_code=status.HTTP_201_CREATED)
+def create_annotator(
+    body: AnnotatorCreate, me: Admin, session: WriteSession, services: UseServices
+) -> AnnotatorOut:
+    """Add an account."""
+    account = accounts.create_annotator(
+        session,
+        services.clock(),
+        name=body.name,
+        role=body.role,
+        kind=body.kind,
+        password=body.password,
+        by=me.id,
+        cheap=services.settings.argon2_cheap,
+    )
+    return _out(account, 0)
+
+
+@router.patch("/annotators/{annotator_id}")
+def change_annotator(
+    annotator_id: PathId,
+    body: AnnotatorPatch,
+    me: Admin,
+    session: WriteSession,
+    services: UseServices,
+) -> AnnotatorOut:
+    """Activate, deactivate, set a password or a role."""
+    account = accounts.change_annotator(
+        session,
+        services.clock(),
+        annotator_id,
+        active=body.active,
+        password=body.password,
+        role=body.role,
+        by=me.id,
+        cheap=services.settings.argon2_cheap,
+    )
+    session.flush()
+    return _out(account, accounts.labels_per_annotator(session).get(account.id, 0))
+
+
+@router.get("/tokens")
+def list_tokens(
+    me: Anyone,
+    session: ReadSession,
+    mine: Annotated[bool, Query(description="only the own tokens")] = False,
+) -> list[TokenOut]:
+    """Own tokens; all of them for admins without `mine`."""
+    everything = me.role == Role.ADMIN and not mine
+    rows = accounts.list_tokens(session, annotator_id=None if everything else me.id)
+    return [TokenOut.model_validate(row) for row in rows]
+
+
+@router.post("/tokens", status_code=status.HTTP_201_CREATED)
+def issue_token(
+    body: TokenCreate, me: Anyone, session: WriteSession, services: UseServices
+) -> TokenIssued:
+    """A new bearer token for the own account, or for any as an admin. It is shown only here."""
+    annotator_id = body.annotator_id or me.id
+    _check_owner(me, annotator_id)
+    token, text = accounts.issue_token(
+        session,
+        services.clock(),
+        annotator_id=annotator_id,
+        name=body.name,
+        days=body.days,
+        by=me.id,
+    )
+    return TokenIssued(id=token.id, token=text, expires_at=token.expires_at)
+
+
+def _check_owner(me: Me, annotator_id: int) -> None:
+    if me.role != Role.ADMIN and annotator_id != me.id:
+        raise NotAllowedError(f"only admins make tokens for other accounts ({annotator_id})")
+
+
+@router.delete("/tokens/{token_id}", status_code=status.HTTP_204_NO_CONTENT)
+def revoke_token(
+    token_id: PathId, me: Anyone, session: WriteSession, services: UseServices
+) -> None:
+    """Revoke an own token, or any as an admin."""
+    accounts.revoke_token(session, services.clock(), token_id, me=me)

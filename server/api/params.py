@@ -1,0 +1,26 @@
+"""Parameters that many endpoints share."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Header, Path, Query
+
+from server.schemas.common import MAX_ID
+
+PathId = Annotated[int, Path(ge=1, le=MAX_ID)]
+Limit = Annotated[int, Query(ge=1, le=1000, description="items on the page")]
+Cursor = Annotated[
+    int | None, Query(ge=0, le=MAX_ID, description="`next_cursor` of the page before")
+]
+IdempotencyKey = Annotated[
+    str,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=64,
+        pattern="^[!-~]+$",
+        description="made by the client for each answer, such as a UUID",
+    ),
+]
+LastEventId = Annotated[int, Header(alias="Last-Event-ID", ge=0, le=MAX_ID)]

@@ -1,0 +1,181 @@
+"""Rounds, checkpoints, jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import APIRouter, Response, status
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from server import checkpoints, rounds
+from server.api.access import ReadSession, Staff, UseServices, WriteSession
+from server.api.params import Limit, PathId
+from server.campaigns import get_campaign
+from server.errors import NotFoundError
+from server.rounds import RoundRequest
+from server.schemas.common import Id, ShortText
+from server.schemas.rounds import CheckpointOut, JobOut, LineageStep, RoundCreate, RoundOut
+from server.states import JobState
+from server.store.tables import Checkpoint, Event, Job, LabelSnapshot, Round
+
+router = APIRouter(tags=["rounds"])
+
+
+def _rounds_out(session: Session, rows: Sequence[Round]) -> list[RoundOut]:
+    candidates: dict[int | None, int] = dict(
+        session.execute(
+            select(Checkpoint.round_id, Checkpoint.id).where(
+                Checkpoint.round_id.in_([row.id for row in rows])
+            )
+        )
+        .tuples()
+        .all()
+    )
+    sizes = dict(
+        session.execute(
+            select(LabelSnapshot.digest, LabelSnapshot.size).where(
+                LabelSnapshot.digest.in_({row.snapshot_digest for row in rows})
+            )
+        )
+        .tuples()
+        .all()
+    )
+    extra = ("candidate_checkpoint_id", "labels")
+    names = [name for name in RoundOut.model_fields if name not in extra]
+    return [
+        RoundOut(
+            candidate_checkpoint_id=candidates.get(row.id),
+            labels=sizes[row.snapshot_digest],
+            **{name: getattr(row, name) for name in names},
+        )
+        for row in rows
+    ]
+
+
+def _round_out(session: Session, row: Round) -> RoundOut:
+    return _rounds_out(session, [row])[0]
+
+
+def _get_round(session: Session, round_id: int) -> Round:
+    found = session.get(Round, round_id)
+    if found is None:
+        raise NotFoundError("round", round_id)
+    return found
+
+
+@router.get("/campaigns/{campaign_id}/rounds")
+def list_rounds(campaign_id: PathId, _me: Staff, session: ReadSession) -> list[RoundOut]:
+    """Rounds of the campaign, newest first."""
+    get_campaign(session, campaign_id)
+    query = select(Round).where(Round.campaign_id == campaign_id).order_by(Round.id.desc())
+    return _rounds_out(session, session.scalars(query).all())
+
+
+@router.post("/campaigns/{campaign_id}/rounds", status_code=status.HTTP_202_ACCEPTED)
+def launch_round(
+    campaign_id: PathId,
+    body: RoundCreate,
+    me: Staff,
+    session: WriteSession,
+    services: UseServices,
+    response: Response,
+) -> RoundOut:
+    """Freeze the labels and fine-tune on them; follow the round at `Location`."""
+    evaluation = None
+    if body.evaluation is not None:
+        evaluation = body.evaluation.model_dump(exclude_none=True)
+    started = rounds.launch(
+        session,
+        services.clock(),
+        campaign_id,
+        RoundRequest(
+            config=body.config,
+            publish_rule=body.publish_rule,
+            evaluation=evaluation,
+            snapshot_digest=body.snapshot_digest,
+            seed=body.seed,
+        ),
+        started_by=me.id,
+    )
+    response.headers["Location"] = f"/api/v1/rounds/{started.id}"
+    return _round_out(session, started)
+
+
+@router.get("/rounds/{round_id}")
+def get_round(round_id: PathId, _me: Staff, session: ReadSession) -> RoundOut:
+    """One round."""
+    return _round_out(session, _get_round(session, round_id))
+
+
+@router.post("/rounds/{round_id}/cancel")
+def cancel_round(
+    round_id: PathId, me: Staff, session: WriteSession, services: UseServices
+) -> RoundOut:
+    """Stop the round; its worker notices at the next sign of life."""
+    return _round_out(session, rounds.cancel(session, services.clock(), round_id, by=me.id))
+
+
+@router.get("/rounds/{round_id}/curves")
+def round_curves(round_id: PathId, _me: Staff, session: ReadSession) -> list[dict[str, Any]]:
+    """Points of the learning curves, in order: stage, step and metrics such as loss, mean_vote."""
+    _get_round(session, round_id)
+    query = select(Event.data).where(Event.round_id == round_id, Event.kind == "curve")
+    return list(session.scalars(query.order_by(Event.id)))
+
+
+@router.get("/checkpoints")
+def list_checkpoints(
+    _me: Staff, session: ReadSession, task: ShortText | None = None
+) -> list[CheckpointOut]:
+    """Checkpoints, newest first."""
+    rows = checkpoints.list_checkpoints(session, task=task)
+    return [CheckpointOut.model_validate(row) for row in rows]
+
+
+@router.get("/checkpoints/{checkpoint_id}")
+def get_checkpoint(checkpoint_id: PathId, _me: Staff, session: ReadSession) -> CheckpointOut:
+    """One checkpoint."""
+    return CheckpointOut.model_validate(checkpoints.get_checkpoint(session, checkpoint_id))
+
+
+@router.get("/checkpoints/{checkpoint_id}/lineage")
+def checkpoint_lineage(
+    checkpoint_id: PathId, _me: Staff, session: ReadSession
+) -> list[LineageStep]:
+    """The checkpoint and its parents, down to the labels behind each."""
+    steps = checkpoints.lineage(session, checkpoint_id)
+    return [LineageStep.model_validate(step) for step in steps]
+
+
+@router.get("/jobs")
+def list_jobs(
+    _me: Staff,
+    session: ReadSession,
+    campaign_id: Id | None = None,
+    state: JobState | None = None,
+    limit: Limit = 100,
+) -> list[JobOut]:
+    """Newest jobs first."""
+    query = select(Job).order_by(Job.id.desc()).limit(limit)
+    if campaign_id is not None:
+        query = query.where(Job.campaign_id == campaign_id)
+    if state is not None:
+        query = query.where(Job.state == state)
+    return [JobOut.model_validate(row) for row in session.scalars(query)]
+
+
+@router.get("/jobs/{job_id}")
+def get_job(job_id: PathId, _me: Staff, session: ReadSession) -> JobOut:
+    """One job."""
+    job = session.get(Job, job_id)
+    if job is None:
+        raise NotFoundError("job", job_id)
+    return JobOut.model_validate(job)
+
+
+@router.post("/jobs/{job_id}/retry")
+def retry_job(job_id: PathId, me: Staff, session: WriteSession, services: UseServices) -> JobOut:
+    """Queue a failed job again."""
+    return JobOut.model_validate(rounds.retry_job(session, services.clock(), job_id, by=me.id))

@@ -1,0 +1,288 @@
+"""Campaigns: create, change, collect, and their figures."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from server.checkpoints import pretrained_by_task, task_facts
+from server.errors import ConflictError, NotFoundError
+from server.publications import record_start
+from server.rounds import EVALUATION_SEED, new_labels_since_round
+from server.states import Choice, JobKind, JobState, PairState
+from server.store import jobs
+from server.store.events import audit
+from server.store.labels import is_effective
+from server.store.pairs import count_by_state
+from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Job, Label, Pair
+
+
+def get_campaign(session: Session, campaign_id: int) -> Campaign:
+    """The row; raises NotFoundError."""
+    campaign = session.get(Campaign, campaign_id)
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    return campaign
+
+
+def create_campaign(
+    session: Session,
+    now: datetime,
+    *,
+    name: str,
+    task: str,
+    criterion: str | None,
+    start_checkpoint_id: int | None,
+    settings: dict[str, Any],
+    by: int,
+) -> Campaign:
+    """A new campaign that publishes its starting checkpoint.
+
+    Raises UnknownNameError for a task without checkpoints, NotFoundError for the checkpoint,
+    ConflictError when the checkpoint is for another task or the name is taken.
+    """
+    start = _start_checkpoint(session, task, start_checkpoint_id)
+    campaign = Campaign(
+        name=name,
+        task=task,
+        criterion=criterion or str(task_facts(start)["criterion"]),
+        settings=settings,
+        start_checkpoint_id=start.id,
+        published_checkpoint_id=start.id,
+        created_by=by,
+        created_at=now,
+    )
+    _insert_or_refuse(session, campaign, name)
+    record_start(session, now, campaign, by=by)
+    audit(
+        session,
+        now,
+        actor_id=by,
+        action="campaign.create",
+        subject=f"campaign/{campaign.id}",
+        details={"name": name, "task": task, "start_checkpoint_id": start.id},
+    )
+    return campaign
+
+
+def _start_checkpoint(session: Session, task: str, checkpoint_id: int | None) -> Checkpoint:
+    by_task = pretrained_by_task(session)
+    if task not in by_task:
+        raise UnknownNameError("task", task, sorted(by_task))
+    if checkpoint_id is None:
+        return by_task[task][-1]
+    checkpoint = session.get(Checkpoint, checkpoint_id)
+    if checkpoint is None:
+        raise NotFoundError("checkpoint", checkpoint_id)
+    if checkpoint.task != task:
+        raise ConflictError(
+            f"checkpoint {checkpoint_id} is for task {checkpoint.task!r}, not for {task!r}"
+        )
+    return checkpoint
+
+
+def _insert_or_refuse(session: Session, campaign: Campaign, name: str) -> None:
+    try:
+        with session.begin_nested():
+            session.add(campaign)
+    except IntegrityError:
+        raise ConflictError(f"there is a campaign named {name!r} already") from None
+
+
+def change_campaign(
+    session: Session,
+    now: datetime,
+    campaign_id: int,
+    *,
+    name: str | None,
+    criterion: str | None,
+    settings: dict[str, Any] | None,
+    archived: bool | None,
+    by: int,
+) -> Campaign:
+    """Change what is not None; `settings` are complete and checked.
+
+    Raises NotFoundError; ConflictError for a taken name, or for another criterion once there are
+    labels, because they were given under the old one.
+    """
+    campaign = session.get(Campaign, campaign_id, with_for_update={"key_share": True})
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    changed: dict[str, Any] = {}
+    if criterion is not None and criterion != campaign.criterion:
+        labels = select(Label.id).where(Label.campaign_id == campaign_id).limit(1)
+        if session.scalar(labels) is not None:
+            raise ConflictError(
+                f"campaign {campaign_id} has labels under its criterion; start a new campaign"
+            )
+        changed["criterion"] = criterion
+    if name is not None:
+        taken = select(Campaign.id).where(Campaign.name == name, Campaign.id != campaign_id)
+        if session.scalar(taken) is not None:
+            raise ConflictError(f"there is a campaign named {name!r} already")
+        changed["name"] = name
+    if settings is not None:
+        changed["settings"] = settings
+    if archived is not None:
+        changed["archived"] = archived
+    for key, value in changed.items():
+        setattr(campaign, key, value)
+    audit(
+        session,
+        now,
+        actor_id=by,
+        action="campaign.change",
+        subject=f"campaign/{campaign_id}",
+        details=changed,
+    )
+    session.flush()
+    return campaign
+
+
+def start_collect(
+    session: Session, now: datetime, campaign_id: int, overrides: Mapping[str, Any], *, by: int
+) -> Job:
+    """Queue rollouts of the published policy; `overrides` are checked settings without None.
+
+    Without a seed the episodes follow those of the collect jobs before, so that none is repeated.
+    Raises NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more
+    pairs than the episodes can form.
+    """
+    campaign = session.get(
+        Campaign, campaign_id, with_for_update={"key_share": True}, populate_existing=True
+    )
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    if campaign.archived:
+        raise ConflictError(f"campaign {campaign_id} is archived")
+    payload: dict[str, Any] = campaign.settings["collect"] | dict(overrides)
+    episodes = int(payload["episodes"])
+    possible = episodes * (episodes - 1) // 2
+    if payload["pairs"] > possible:
+        raise ValueOutOfRangeError("pairs", payload["pairs"], f"at most {possible} of {episodes}")
+    payload["checkpoint_id"] = campaign.published_checkpoint_id
+    if "seed" not in payload:
+        payload["seed"] = _next_seed(session, campaign)
+    job = jobs.enqueue(
+        session,
+        now,
+        kind=JobKind.COLLECT,
+        campaign_id=campaign_id,
+        payload=payload,
+        created_by=by,
+    )
+    audit(
+        session,
+        now,
+        actor_id=by,
+        action="campaign.collect",
+        subject=f"campaign/{campaign_id}",
+        details={"job_id": job.id} | payload,
+    )
+    session.flush()
+    return job
+
+
+def _next_seed(session: Session, campaign: Campaign) -> int:
+    """First seed that no collect job has planned and no episode of the campaign has used."""
+    used = session.scalar(
+        select(func.max(Episode.seed)).where(
+            Episode.campaign_id == campaign.id, Episode.seed < EVALUATION_SEED
+        )
+    )
+    first = 0 if used is None else used + 1
+    planned = select(Job.payload).where(Job.campaign_id == campaign.id, Job.kind == JobKind.COLLECT)
+    for payload in session.scalars(planned):
+        end = int(payload["seed"]) + int(payload["episodes"])
+        if end <= EVALUATION_SEED:
+            first = max(first, end)
+    return first
+
+
+def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
+    """Figures of the campaign, as `StatsOut` shows them; raises NotFoundError."""
+    get_campaign(session, campaign_id)
+    pairs = count_by_state(session, campaign_id)
+    episodes = select(func.count()).where(Episode.campaign_id == campaign_id)
+    return {
+        "episodes": session.scalar(episodes),
+        "pairs": {
+            "ready": pairs[PairState.READY],
+            "waiting": pairs[PairState.WAITING],
+            "failed": pairs[PairState.FAILED],
+            "labelled": session.scalar(
+                select(func.count(Label.pair_id.distinct())).where(
+                    Label.campaign_id == campaign_id, is_effective()
+                )
+            ),
+        },
+        "labels": _label_counts(session, campaign_id),
+        "annotators": _annotator_counts(session, campaign_id),
+        "jobs": _job_counts(session, campaign_id),
+    }
+
+
+def _label_counts(session: Session, campaign_id: int) -> dict[str, Any]:
+    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign_id))
+    query = select(Label.choice, func.count()).where(
+        Label.campaign_id == campaign_id, is_effective()
+    )
+    found = dict(session.execute(query.group_by(Label.choice)).tuples().all())
+    by_choice = {choice.value: found.get(choice.value, 0) for choice in Choice}
+    return {
+        "total": total,
+        "effective": sum(by_choice.values()),
+        "by_choice": by_choice,
+        "new_since_round": new_labels_since_round(session, campaign_id),
+    }
+
+
+def _annotator_counts(session: Session, campaign_id: int) -> list[dict[str, Any]]:
+    rows = session.execute(
+        select(Label.annotator_id, Label.choice, Label.duration_ms, Pair.first_is_left)
+        .join(Pair, Pair.id == Label.pair_id)
+        .where(Label.campaign_id == campaign_id, is_effective())
+    ).all()
+    labels = Counter(row.annotator_id for row in rows)
+    durations: dict[int, list[int]] = defaultdict(list)
+    sides: dict[int, list[bool]] = defaultdict(list)
+    for row in rows:
+        if row.duration_ms is not None:
+            durations[row.annotator_id].append(row.duration_ms)
+        if row.choice in (Choice.FIRST, Choice.SECOND):
+            sides[row.annotator_id].append((row.choice == Choice.FIRST) == row.first_is_left)
+    accounts = session.scalars(select(Annotator).where(Annotator.id.in_(labels)))
+    return [
+        {
+            "id": account.id,
+            "name": account.name,
+            "kind": account.kind,
+            "labels": labels[account.id],
+            "median_duration_ms": _median(durations[account.id]),
+            "left_share": _share(sides[account.id]),
+        }
+        for account in sorted(accounts, key=lambda account: account.id)
+    ]
+
+
+def _median(values: list[int]) -> float | None:
+    return float(statistics.median(values)) if values else None
+
+
+def _share(flags: list[bool]) -> float | None:
+    return sum(flags) / len(flags) if flags else None
+
+
+def _job_counts(session: Session, campaign_id: int) -> dict[str, int]:
+    query = select(Job.state, func.count()).where(Job.campaign_id == campaign_id)
+    found = dict(session.execute(query.group_by(Job.state)).tuples().all())
+    shown = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
+    return {state.value: found.get(state.value, 0) for state in shown}

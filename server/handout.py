@@ -1,0 +1,179 @@
+"""Handing out pairs to annotators under leases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from server.errors import NotFoundError
+from server.states import PairState
+from server.store.labels import is_effective
+from server.store.pairs import (
+    count_by_state,
+    count_taken,
+    live_leases,
+    open_pairs,
+    taken_by_others,
+)
+from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pair
+
+MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetching
+
+
+class NothingReason(StrEnum):
+    """Why there is nothing to label; sent as the header X-Reason."""
+
+    NO_PAIRS = "no_pairs"
+    REPLAYS_WAITING = "replays_waiting"
+    ALL_DONE = "all_done"
+
+
+@dataclass(frozen=True)
+class Handout:
+    """A leased pair, and how far the annotator is. Nothing of policies, modes or other labels."""
+
+    lease: Lease
+    pair: Pair
+    criterion: str
+    duration_s: float | None  # of the longer episode
+    done: int
+    remaining: int  # including the pairs that the annotator holds
+
+
+def next_pair(
+    session: Session,
+    now: datetime,
+    campaign_id: int,
+    annotator_id: int,
+    *,
+    lease_for: timedelta,
+    hold: int = 1,
+    prefetch_after: int | None = None,
+) -> Handout | NothingReason:
+    """The pair to label next, under a lease.
+
+    What the annotator holds already comes first (a reloaded page gets its pair back). While fewer
+    than `hold` pairs are held a new one is leased; with `prefetch_after` the answer is never that
+    pair. Raises NotFoundError.
+    """
+    campaign = session.get(Campaign, campaign_id)
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    if campaign.archived:
+        return NothingReason.ALL_DONE
+    _one_request_at_a_time(session, campaign_id, annotator_id)
+    held = list(live_leases(session, now, campaign_id, annotator_id))
+    others = [lease for lease in held if lease.pair_id != prefetch_after]
+    if others and (prefetch_after is not None or len(held) >= min(hold, MAX_HOLD)):
+        return handout(session, now, campaign, _prolong(others[0], now, lease_for))
+    pair = _take_open_pair(session, now, campaign, annotator_id)
+    if pair is not None:
+        lease = issue_lease(session, now, pair.id, annotator_id, lease_for=lease_for)
+        return handout(session, now, campaign, lease)
+    if others:
+        return handout(session, now, campaign, _prolong(others[0], now, lease_for))
+    return _why_nothing(session, campaign_id)
+
+
+def _one_request_at_a_time(session: Session, campaign_id: int, annotator_id: int) -> None:
+    """Two tabs of one annotator take turns (SQLite's writers do so anyway)."""
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(select(func.pg_advisory_xact_lock(campaign_id, annotator_id)))
+
+
+def _prolong(lease: Lease, now: datetime, lease_for: timedelta) -> Lease:
+    lease.expires_at = now + lease_for
+    return lease
+
+
+def _take_open_pair(
+    session: Session, now: datetime, campaign: Campaign, annotator_id: int
+) -> Pair | None:
+    """Find a pair with room and lock its row, so that nobody else counts the same room.
+
+    The room is counted again under the lock: the search may have seen the state before another
+    annotator's lease. Rows that others hold locked are skipped at first, and waited for when
+    nothing else is left.
+    """
+    wanted = int(campaign.settings["labels_per_pair"])
+    refused: list[int] = []
+    skip_locked = True
+    while True:
+        query = (
+            open_pairs(now, campaign.id, annotator_id, labels_per_pair=wanted)
+            .where(Pair.id.not_in(refused))
+            .order_by(taken_by_others(now, annotator_id), Pair.id)
+            .limit(1)
+            .with_for_update(of=Pair, key_share=True, skip_locked=skip_locked)
+        )
+        pair = session.scalars(query).one_or_none()
+        if pair is None and not skip_locked:
+            return None
+        if pair is None:
+            skip_locked = False
+        elif count_taken(session, now, pair.id, annotator_id) < wanted:
+            return pair
+        else:
+            refused.append(pair.id)
+
+
+def issue_lease(
+    session: Session, now: datetime, pair_id: int, annotator_id: int, *, lease_for: timedelta
+) -> Lease:
+    """Hand the pair to the annotator. The caller has locked the pair and counted its room."""
+    lease = Lease(
+        pair_id=pair_id, annotator_id=annotator_id, issued_at=now, expires_at=now + lease_for
+    )
+    session.add(lease)
+    session.flush()
+    return lease
+
+
+def handout(session: Session, now: datetime, campaign: Campaign, lease: Lease) -> Handout:
+    """The lease with what its page shows."""
+    session.flush()
+    pair = session.get_one(Pair, lease.pair_id)
+    mine = select(func.count()).where(
+        Label.campaign_id == campaign.id,
+        Label.annotator_id == lease.annotator_id,
+        is_effective(),
+    )
+    still_open = open_pairs(
+        now,
+        campaign.id,
+        lease.annotator_id,
+        labels_per_pair=int(campaign.settings["labels_per_pair"]),
+    )
+    counted = session.execute(select(func.count()).select_from(still_open.subquery())).scalar_one()
+    held = len(live_leases(session, now, campaign.id, lease.annotator_id))
+    return Handout(
+        lease=lease,
+        pair=pair,
+        criterion=campaign.criterion,
+        duration_s=_duration(session, pair),
+        done=session.execute(mine).scalar_one(),
+        remaining=counted + held,
+    )
+
+
+def _duration(session: Session, pair: Pair) -> float | None:
+    """Seconds of the longer episode; None when the checkpoint does not tell its control step."""
+    seconds: float | None = None
+    for episode_id in (pair.first_episode_id, pair.second_episode_id):
+        episode = session.get_one(Episode, episode_id)
+        checkpoint = session.get_one(Checkpoint, episode.checkpoint_id)
+        control_dt = checkpoint.config.get("task_facts", {}).get("control_dt")
+        if control_dt is not None:
+            seconds = max(seconds or 0.0, episode.steps * float(control_dt))
+    return seconds
+
+
+def _why_nothing(session: Session, campaign_id: int) -> NothingReason:
+    counts = count_by_state(session, campaign_id)
+    if counts[PairState.WAITING] > 0:
+        return NothingReason.REPLAYS_WAITING
+    return NothingReason.ALL_DONE if any(counts.values()) else NothingReason.NO_PAIRS

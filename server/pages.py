@@ -1,0 +1,206 @@
+"""HTML pages and files for browsers. The pages themselves speak REST only.
+
+Nothing here imports the packages whose files it serves: `find_spec` tells where they lie.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from fastapi import APIRouter, FastAPI, Request
+from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Response
+from fastapi.staticfiles import StaticFiles
+from fastapi.templating import Jinja2Templates
+
+from server.api.access import COOKIE, Anyone, UseServices, who
+from server.api.services import services_of
+from server.errors import ArtifactError, NotFoundError, NotSignedInError
+from server.sign_in import Me
+from server.states import Role
+from server.store.tables import Campaign
+
+PAGE_POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
+    " object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+)
+# The viewer is one file with inline scripts and WebAssembly. A recording can carry scripts that
+# the viewer would run with `new Function`: without 'unsafe-eval' the browser refuses them.
+REPLAY_CLIENT_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:;"
+    " worker-src blob: data:; connect-src 'self' data: blob:; img-src 'self' data: blob:;"
+    " style-src 'self' 'unsafe-inline'; font-src 'self' data:; object-src 'none';"
+    " base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+FOR_EVER = "private, max-age=31536000, immutable"  # content-addressed files never change
+
+router = APIRouter(include_in_schema=False)
+
+
+def package_folder(package: str) -> Path:
+    """Folder of an installed package, without importing it; raises NotFoundError."""
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise NotFoundError("installed package", package)
+    return Path(spec.origin).parent
+
+
+def _site() -> Path:
+    return package_folder("labeling_ui") / "site"
+
+
+def install(app: FastAPI) -> None:
+    """Add the pages, their static files and the files behind the session to the application."""
+    site = _site()
+    app.state.templates = Jinja2Templates(directory=site / "templates")
+    app.state.ui_version = f"{app.version}+{_fingerprint(site)}"
+    app.include_router(router)
+    app.mount("/static", StaticFiles(directory=site / "static", check_dir=False), name="static")
+
+
+def _fingerprint(site: Path) -> str:
+    """First 12 digits of the SHA-256 over all files of the site; stored with every label."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in site.rglob("*") if path.is_file()):
+        digest.update(str(path.relative_to(site)).encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _visitor(request: Request) -> Me | None:
+    try:
+        return who(services_of(request), token=None, cookie=request.cookies.get(COOKIE))
+    except NotSignedInError:
+        return None
+
+
+def _home(me: Me) -> str:
+    return "/admin" if me.role == Role.ADMIN else "/label"
+
+
+def _to_sign_in(request: Request) -> RedirectResponse:
+    return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", status_code=303)
+
+
+def _render(request: Request, template: str, **context: Any) -> Response:
+    templates = request.app.state.templates
+    assert isinstance(templates, Jinja2Templates)
+    context["ui_version"] = request.app.state.ui_version
+    headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-store"}
+    return templates.TemplateResponse(request, template, context, headers=headers)
+
+
+def _page(
+    request: Request, template: str, *, admin: bool = False, campaign_id: int | None = None
+) -> Response:
+    """A page for the signed-in; others go to the sign-in page or, if not admins, to `/label`."""
+    me = _visitor(request)
+    if me is None:
+        return _to_sign_in(request)
+    if admin and me.role != Role.ADMIN:
+        return RedirectResponse("/label", status_code=303)
+    if campaign_id is None:
+        return _render(request, template, me=me)
+    with services_of(request).database.read() as session:
+        campaign = session.get(Campaign, campaign_id)
+    if campaign is None:
+        text = f"<!doctype html><title>Not found</title><p>There is no campaign {campaign_id}."
+        return HTMLResponse(f'{text} <a href="{_home(me)}">Back</a>', status_code=404)
+    return _render(request, template, me=me, campaign=campaign)
+
+
+@router.get("/")
+def root(request: Request) -> Response:
+    """To where this account works."""
+    me = _visitor(request)
+    return _to_sign_in(request) if me is None else RedirectResponse(_home(me), status_code=303)
+
+
+@router.get("/sign-in")
+def sign_in_page(request: Request) -> Response:
+    """Name and password."""
+    me = _visitor(request)
+    if me is not None:
+        return RedirectResponse(_home(me), status_code=303)
+    return _render(request, "sign_in.html", me=None)
+
+
+@router.get("/label")
+def label_index(request: Request) -> Response:
+    """The campaigns that can be labelled."""
+    return _page(request, "label_home.html")
+
+
+@router.get("/label/{campaign_id:int}")
+def label_page(request: Request, campaign_id: int) -> Response:
+    """The annotator's page."""
+    return _page(request, "label.html", campaign_id=campaign_id)
+
+
+@router.get("/admin")
+def admin_index(request: Request) -> Response:
+    """All campaigns, accounts, jobs."""
+    return _page(request, "admin_index.html", admin=True)
+
+
+@router.get("/admin/campaigns/{campaign_id:int}")
+def admin_campaign(request: Request, campaign_id: int) -> Response:
+    """One campaign with its rounds."""
+    return _page(request, "admin_campaign.html", admin=True, campaign_id=campaign_id)
+
+
+def _artifact(services: UseServices, sha256: str, media_type: str) -> FileResponse:
+    path = services.artifacts.path(sha256)
+    if not path.is_file():
+        raise ArtifactError(f"artifact {sha256} is missing")
+    headers = {"Cache-Control": FOR_EVER, "Content-Security-Policy": "default-src 'none'; sandbox"}
+    return FileResponse(path, media_type=media_type, headers=headers)
+
+
+@router.api_route("/replays/{sha256}.viser", methods=["GET", "HEAD"])
+def replay(sha256: str, _me: Anyone, services: UseServices) -> FileResponse:
+    """A recording for the replay client."""
+    return _artifact(services, sha256, "application/octet-stream")
+
+
+@router.api_route("/thumbnails/{sha256}.webp", methods=["GET", "HEAD"])
+def thumbnail(sha256: str, _me: Anyone, services: UseServices) -> FileResponse:
+    """An animated picture of a pair."""
+    return _artifact(services, sha256, "image/webp")
+
+
+@router.get("/replay-client/")
+def replay_client(request: Request) -> Response:
+    """The viewer out of the installed viser package, with our adapter in its head."""
+    if _visitor(request) is None:
+        raise NotSignedInError("sign in first")
+    page = _replay_client_page()
+    tag = f'"{hashlib.sha256(page).hexdigest()[:32]}"'
+    headers = {
+        "Content-Security-Policy": REPLAY_CLIENT_POLICY,
+        "Cache-Control": "private, no-cache",
+        "ETag": tag,
+    }
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    return Response(page, media_type="text/html", headers=headers)
+
+
+def _replay_client_page() -> bytes:
+    page = (package_folder("viser") / "client" / "build" / "index.html").read_bytes()
+    head, found, rest = page.partition(b"</head>")
+    if not found:
+        raise NotFoundError("</head> in the page of the installed viser", "index.html")
+    adapter = (_site() / "static" / "replay-adapter.js").read_bytes()
+    return head + b"<script>" + adapter + b"</script>" + found + rest
+
+
+@router.get("/vendor/plotly.min.js")
+def plotly() -> FileResponse:
+    """The chart library out of the installed plotly package."""
+    path = package_folder("plotly") / "package_data" / "plotly.min.js"
+    headers = {"Cache-Control": "public, max-age=86400"}
+    return FileResponse(path, media_type="text/javascript", headers=headers)
