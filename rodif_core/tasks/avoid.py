@@ -64,8 +64,8 @@ class AvoidTask(Task):
         f"{side}-{second}{third}" for side, second, third in product("LR", "123", "1234")
     )
     criterion: ClassVar[str] = (
-        "The rod should pass the first cylinder on its left and reach the finish line "
-        "without touching any cylinder."
+        "The rod should pass the first cylinder on the left (seen in the direction of travel: "
+        "on the robot's side) and reach the finish line without touching any cylinder."
     )
 
     def build_model(self, mesh: Mesh = "col") -> mujoco.MjModel:
