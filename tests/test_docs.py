@@ -1,0 +1,107 @@
+"""The documents name every command, option, setting and word, and their links lead somewhere."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+from enum import StrEnum
+from pathlib import Path
+
+import pytest
+
+from rodif_core import spec
+from server import states
+from server.schemas.campaigns import CampaignSettings, CollectSettings
+from server.settings import Settings
+from worker.cli.main import build_parser
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
+ENUMS = [
+    value
+    for module in (spec, states)
+    for value in vars(module).values()
+    if isinstance(value, type) and issubclass(value, StrEnum) and value is not StrEnum
+]
+CONFIGS = (spec.FinetuneConfig, spec.GuideConfig, spec.RolloutConfig)
+
+
+def text_of(name: str) -> str:
+    return (DOCS / name).read_text()
+
+
+@pytest.mark.parametrize("enum", ENUMS, ids=lambda enum: enum.__name__)
+def test_every_value_of_an_enum_stands_in_the_glossary(enum: type[StrEnum]):
+    missing = [member.value for member in enum if f"`{member.value}`" not in text_of("glossary.md")]
+    assert missing == []
+
+
+def test_every_environment_setting_is_documented_with_its_default():
+    text = text_of("configuration.md")
+    for name, field in Settings.model_fields.items():
+        row = re.search(rf"^\| `RODIF_{name.upper()}` \|(.*)$", text, flags=re.MULTILINE)
+        assert row, name
+        if isinstance(field.default, int | float) and not isinstance(field.default, bool):
+            assert f"| {field.default:g} |" in row.group(0), name
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.__name__)
+def test_every_field_of_a_configuration_is_documented(config: type):
+    text = text_of("configuration.md")
+    for field in dataclasses.fields(config):
+        assert f"| `{field.name}` |" in text, field.name
+
+
+@pytest.mark.parametrize("config", [CampaignSettings, CollectSettings])
+def test_every_campaign_setting_is_documented(config: type):
+    text = text_of("configuration.md")
+    for name in config.model_fields:
+        assert f"`{name}`" in text, name
+
+
+def subcommands() -> dict[str, argparse.ArgumentParser]:
+    for action in build_parser()._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    raise AssertionError("rodif has no commands")
+
+
+@pytest.mark.parametrize("name", subcommands())
+def test_every_command_and_option_is_documented(name: str):
+    sections = re.split(r"^## ", text_of("commands.md"), flags=re.MULTILINE)
+    section = next((part for part in sections if part.startswith(f"rodif {name}\n")), None)
+    assert section, f"no section for rodif {name}"
+    for action in subcommands()[name]._actions:
+        for option in action.option_strings:
+            if option not in ("-h", "--help"):
+                assert f"`{option}" in section, f"rodif {name} {option}"
+
+
+@pytest.mark.parametrize("name", subcommands())
+def test_no_section_names_an_option_that_does_not_exist(name: str):
+    sections = re.split(r"^## ", text_of("commands.md"), flags=re.MULTILINE)
+    section = next(part for part in sections if part.startswith(f"rodif {name}\n"))
+    legal = {option for action in subcommands()[name]._actions for option in action.option_strings}
+    assert set(re.findall(r"`(--[a-z-]+)", section)) <= legal
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", link):
+            continue
+        target, _, anchor = link.partition("#")
+        file = (page.parent / target).resolve() if target else page
+        assert file.exists(), f"{page.name}: {link}"
+        if anchor:
+            assert anchor in anchors(file), f"{page.name}: {link}"
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of headings, as code hosts make them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)
+    plain = [re.sub(r"[^\w\s-]", "", heading.lower()).strip() for heading in headings]
+    return {re.sub(r"\s", "-", heading) for heading in plain}
