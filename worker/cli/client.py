@@ -114,7 +114,7 @@ class Client:
 
     def find_campaign(self, name_or_id: str | None) -> Json:
         """The campaign by name or number; None means the only one there is."""
-        campaigns: list[Json] = list(self.pages("/campaigns"))
+        campaigns: list[Json] = self.get("/campaigns")
         if name_or_id is None and len(campaigns) == 1:
             return campaigns[0]
         for campaign in campaigns:

@@ -103,8 +103,9 @@ def run(args: argparse.Namespace) -> int:
             row = bar.add_task(f"round {started['id']}", total=1.0)
 
             def show(state: Mapping[str, Any]) -> None:
-                jobs = list(api.pages(f"/jobs?round_id={started['id']}"))
-                stage, done = (jobs[0]["stage"], jobs[0]["progress"]) if jobs else ("", 0.0)
+                newest = api.get(f"/jobs?campaign_id={state['campaign_id']}")
+                ours = [job for job in newest if job["round_id"] == state["id"]]
+                stage, done = (ours[0]["stage"], ours[0]["progress"]) if ours else ("", 0.0)
                 text = f"round {state['id']} {state['state']} {stage}"
                 bar.update(row, description=text, completed=done)
 

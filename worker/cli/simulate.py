@@ -19,6 +19,7 @@ import sys
 import threading
 import time
 import uuid
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -101,7 +102,7 @@ def simulate(
     rng = np.random.default_rng(config.seed)
     started = time.monotonic()
     truth = TrueChoices(admin, campaign)
-    labels = min(config.labels, truth.count_unlabelled_preferences())
+    labels = min(config.labels, truth.count_missing_preferences())
     draw = exact_flips if config.corruption == "exact" else independent_flips
     tickets: queue.SimpleQueue[bool] = queue.SimpleQueue()
     for flip in draw(labels, config.flip_rate, rng):
@@ -122,39 +123,55 @@ def simulate(
 
 
 class TrueChoices:
-    """True answers to the pairs of a campaign, fetched once; shared by the annotators' threads."""
+    """True answers to the pairs of a campaign; shared by the annotators' threads."""
 
     def __init__(self, api: Client, campaign: Mapping[str, Any]) -> None:
         self._api, self._campaign = api, campaign
         tasks = {task["name"]: task for task in api.get("/tasks")}
         self._preferred_group: str = tasks[campaign["task"]]["preferred_group"]
-        self._known: dict[int, str] = {}
+        path = f"/campaigns/{campaign['id']}"
+        episodes = {row["id"]: row for row in api.pages(f"{path}/episodes?limit=500")}
+        self._known = {
+            pair["id"]: self._answer(
+                pair, episodes[pair["first_episode_id"]], episodes[pair["second_episode_id"]]
+            )
+            for pair in api.pages(f"{path}/pairs?limit=500")
+            if pair["state"] != "failed"
+        }
         self._lock = threading.Lock()
+
+    def _answer(
+        self, pair: Mapping[str, Any], first: Mapping[str, Any], second: Mapping[str, Any]
+    ) -> str:
+        left, right = (first, second) if pair["first_is_left"] else (second, first)
+        return true_choice(left, right, self._preferred_group)
 
     def of(self, pair_id: int) -> str:
         """ "left", "right" or "equal" for a pair as it stands on the screen."""
         with self._lock:
-            if pair_id not in self._known:
-                sides = self._api.get(f"/pairs/{pair_id}/episodes")
-                outcomes = (sides["first"], sides["second"])
-                left, right = outcomes if sides["first_is_left"] else outcomes[::-1]
-                self._known[pair_id] = true_choice(left, right, self._preferred_group)
+            if pair_id not in self._known:  # made since
+                both = self._api.get(f"/pairs/{pair_id}/episodes")
+                self._known[pair_id] = self._answer(both, both["first"], both["second"])
             return self._known[pair_id]
 
-    def count_unlabelled_preferences(self) -> int:
+    def count_missing_preferences(self) -> int:
         """How many more preferences the campaign's pairs can take."""
-        pairs = self._api.pages(f"/campaigns/{self._campaign['id']}/pairs?limit=200")
-        wanted = self._campaign["settings"]["labels_per_pair"]
+        rows = list(self._api.pages(f"/campaigns/{self._campaign['id']}/labels?limit=500"))
+        superseded = {row["supersedes_id"] for row in rows}
+        given = Counter(
+            row["pair_id"] for row in rows if row["id"] not in superseded and not row["retracted"]
+        )
+        wanted: int = self._campaign["settings"]["labels_per_pair"]
         return sum(
-            max(0, wanted - pair["labels"])
-            for pair in pairs
-            if pair["state"] != "failed" and self.of(pair["id"]) != "equal"
+            max(0, wanted - given[pair_id])
+            for pair_id, answer in self._known.items()
+            if answer != "equal"
         )
 
 
 def annotator_tokens(admin: Client, config: SimulationConfig) -> list[str]:
     """A bearer token for each simulated annotator; accounts are made when they do not exist."""
-    accounts = {account["name"]: account for account in admin.pages("/annotators?limit=200")}
+    accounts = {account["name"]: account for account in admin.get("/annotators")}
     tokens = []
     for number in range(1, config.annotators + 1):
         name = f"{config.name}-{number}"
