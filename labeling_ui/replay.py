@@ -104,7 +104,7 @@ def _record(server: viser.ViserServer, task: Task, sides: tuple[_Side, _Side]) -
         for track in tracks:
             track.show(frame)
     recording.insert_sleep(HOLD)
-    return recording.serialize()
+    return bytes(recording.serialize())
 
 
 def _set_stage(server: viser.ViserServer) -> None:
@@ -202,16 +202,25 @@ class _Track:
                 handle.visible = True
 
 
-def _add_shape(scene: Any, name: str, shape: Shape, **changes: Any) -> Any:
-    place = {
-        "color": shape.colour,
+def _add_shape(
+    scene: Any,
+    name: str,
+    shape: Shape,
+    *,
+    colour: tuple[int, int, int] | None = None,
+    grown: float = 1.0,
+    visible: bool = True,
+) -> Any:
+    """Draw a shape; `colour` and `grown` (a scale factor) replace its own look."""
+    place: dict[str, Any] = {
+        "color": colour or shape.colour,
         "position": shape.position,
         "wxyz": shape.wxyz,
         "opacity": None if shape.opacity >= 1 else shape.opacity,
         "cast_shadow": False,
         "receive_shadow": False,
-    } | changes
-    grown = place.pop("grown", 1.0)
+        "visible": visible,
+    }
     if shape.kind == "box":
         size = tuple(2 * grown * half for half in shape.size)
         return scene.add_box(name, dimensions=size, **place)
@@ -230,7 +239,7 @@ def _add_hit(scene: Any, root: str, shapes: tuple[Shape, ...], hit: int | None) 
     for shape in shapes:
         if shape.geom == hit:
             name = f"{root}/b{shape.body}/touched"
-            body = _add_shape(scene, name, shape, color=HIT_COLOUR, grown=1.02, visible=False)
+            body = _add_shape(scene, name, shape, colour=HIT_COLOUR, grown=1.02, visible=False)
             above = shape.position + np.array([0.0, 0.0, shape.size[-1] + 0.06])
             label = scene.add_label(
                 f"{root}/b{shape.body}/touched_label",

@@ -139,7 +139,7 @@ def _round(values: Array) -> Array:
 
 
 def _is_drawn(model: mujoco.MjModel, geom: int) -> bool:
-    return (
+    return bool(
         model.geom_group[geom] <= VISUAL_GROUP
         and model.geom_rgba[geom, 3] > 0
         and model.geom(geom).name != TABLE_GEOM

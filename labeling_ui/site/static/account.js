@@ -1,0 +1,17 @@
+import { request } from "./api.js";
+import { describe, find, toast } from "./dom.js";
+
+find("#sign-out").addEventListener("click", async () => {
+  try {
+    await request("DELETE", "/session");
+    location.assign("/sign-in");
+  } catch (error) {
+    if (error.status === 401) location.assign("/sign-in");
+    else toast(describe(error), { bad: true });
+  }
+});
+
+const menu = find(".menu");
+document.addEventListener("click", (event) => {
+  if (!menu.contains(event.target)) menu.open = false;
+});

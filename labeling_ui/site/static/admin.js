@@ -1,0 +1,69 @@
+// The list of campaigns, and the dialog that makes a new one.
+
+import { ApiError, get, post, signInAddress } from "./api.js";
+import { ask, describe, element, find, replace } from "./dom.js";
+import { count, words } from "./format.js";
+
+const box = find("#campaigns");
+
+async function load() {
+  try {
+    const campaigns = await get("/campaigns");
+    const cards = await Promise.all(campaigns.map(card));
+    replace(box, cards.length > 0 ? cards : nothing());
+  } catch (error) {
+    if (error instanceof ApiError && error.status === 401) location.assign(signInAddress());
+    replace(box, element("p.form-error", { role: "alert" }, describe(error)));
+  }
+}
+
+function nothing() {
+  return element(
+    "div.card.empty", {},
+    element("strong", {}, "No campaign yet"), "Make one to collect runs and have them compared.",
+  );
+}
+
+async function card(campaign) {
+  const stats = await get(`/campaigns/${campaign.id}/stats`);
+  const fact = (value, name) => element("span", {}, element("b", {}, count(value)), ` ${name}`);
+  return element(
+    "a.card.campaign-card", { href: `/admin/campaigns/${campaign.id}` },
+    element("div.live-head", {}, element("h2", {}, campaign.name), element("span.pill", {}, words(campaign.task))),
+    element("p.muted", {}, campaign.criterion),
+    element(
+      "div.facts", {},
+      fact(stats.episodes, "runs"), fact(stats.pairs.ready, "pairs"), fact(stats.labels.effective, "labels"),
+      stats.labels.new_since_round > 0 ? fact(stats.labels.new_since_round, "new since the last round") : null,
+    ),
+  );
+}
+
+async function create() {
+  let tasks;
+  try {
+    tasks = await get("/tasks");
+  } catch (error) {
+    replace(box, element("p.form-error", { role: "alert" }, describe(error)));
+    return;
+  }
+  const made = {};
+  const values = await ask({
+    title: "New campaign",
+    confirm: "Create",
+    fields: [
+      { name: "name", label: "Name", required: true, placeholder: "Avoid, left side" },
+      { name: "task", label: "Robot task", kind: "select", options: tasks.map((task) => [task.name, words(task.name)]) },
+      { name: "criterion", label: "What annotators are asked", kind: "textarea", value: tasks[0]?.criterion ?? "", required: true },
+      { name: "labels_per_pair", label: "Labels per pair", kind: "number", value: 1, min: 1, max: 20, step: 1, hint: "Two or more let the noise be measured from overlap." },
+    ],
+    onSubmit: async ({ name, task, criterion, labels_per_pair }) => {
+      const settings = { labels_per_pair: labels_per_pair ?? 1 };
+      made.campaign = await post("/campaigns", { name, task, criterion, settings });
+    },
+  });
+  if (values) location.assign(`/admin/campaigns/${made.campaign.id}`);
+}
+
+find("#new-campaign").addEventListener("click", create);
+load();

@@ -1,0 +1,65 @@
+// Learning curves of a round, drawn by plotly.js from the installed package.
+
+import { find } from "./dom.js";
+
+let library = null;
+
+function loadPlotly() {
+  library ??= new Promise((resolve, reject) => {
+    const script = document.createElement("script");
+    script.src = "/vendor/plotly.min.js";
+    script.addEventListener("load", () => resolve(window.Plotly));
+    script.addEventListener("error", () => reject(new Error("the chart library did not load")));
+    document.head.append(script);
+  });
+  return library;
+}
+
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+function layout(title, axis) {
+  const line = css("--line");
+  const font = { family: css("--font"), size: 12, color: css("--muted") };
+  return {
+    title: { text: title, font: { ...font, size: 14, color: css("--ink") }, x: 0, xref: "paper", xanchor: "left" },
+    font, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    margin: { l: 48, r: 12, t: 36, b: 58 },
+    xaxis: { title: { text: "update" }, gridcolor: line, zerolinecolor: line, rangemode: "tozero" },
+    yaxis: { gridcolor: line, zerolinecolor: line, ...axis },
+    legend: { orientation: "h", x: 0, y: -0.28 },
+    hovermode: "x unified",
+  };
+}
+
+// Points of one stage become one line, in the order in which they came.
+function traces(points, value, colours) {
+  const stages = new Map();
+  for (const point of points) {
+    if (typeof point[value] !== "number") continue;
+    if (!stages.has(point.stage)) stages.set(point.stage, []);
+    stages.get(point.stage).push(point[value]);
+  }
+  return [...stages].map(([stage, values], index) => ({
+    type: "scatter", mode: values.length > 1 ? "lines" : "markers", name: stage,
+    x: values.map((_, step) => step + 1), y: values,
+    line: { width: 2, color: colours[index % colours.length] },
+  }));
+}
+
+// Returns whether there was anything to draw.
+export async function drawCurves(points) {
+  const colours = [css("--accent"), "#b07a1e", "#8a5fb0", "#5d7f3a", "#b3261e", "#56636f"];
+  const losses = traces(points, "loss", colours);
+  const votes = traces(points, "mean_vote", colours);
+  if (losses.length === 0 && votes.length === 0) return false;
+  const plotly = await loadPlotly();
+  const options = { displayModeBar: false, responsive: true };
+  const box = find("#vote-chart");
+  box.hidden = votes.length === 0;
+  await plotly.react(find("#loss-chart"), losses, layout("Loss"), options);
+  if (votes.length > 0) {
+    const half = { range: [0, 1], tickformat: ".0%" };
+    await plotly.react(box, votes, layout("Mean vote for the labelled winner", half), options);
+  }
+  return true;
+}

@@ -1,0 +1,29 @@
+// Numbers and times as people read them.
+
+export const percent = (rate, digits = 0) =>
+  rate === null || rate === undefined ? "–" : `${(100 * rate).toFixed(digits)} %`;
+
+export const interval = (pair) =>
+  Array.isArray(pair) ? `${(100 * pair[0]).toFixed(0)}–${(100 * pair[1]).toFixed(0)}` : "";
+
+export const count = (value) => (value ?? 0).toLocaleString("en-GB");
+
+export function duration(milliseconds) {
+  if (milliseconds === null || milliseconds === undefined) return "–";
+  const seconds = milliseconds / 1000;
+  if (seconds < 10) return `${seconds.toFixed(1)} s`;
+  if (seconds < 100) return `${Math.round(seconds)} s`;
+  return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
+}
+
+export function ago(text, now = Date.now()) {
+  if (!text) return "–";
+  const seconds = Math.max(0, (now - new Date(text).getTime()) / 1000);
+  if (seconds < 45) return "just now";
+  if (seconds < 3600) return `${Math.round(seconds / 60)} min ago`;
+  if (seconds < 86_400) return `${Math.round(seconds / 3600)} h ago`;
+  return new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
+}
+
+export const words = (name) => String(name ?? "").replaceAll("_", " ");
+export const short = (digest) => String(digest ?? "").slice(0, 10);

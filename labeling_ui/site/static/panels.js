@@ -1,0 +1,185 @@
+// Tables and tiles of the campaign page. Each function takes data and returns elements.
+
+import { element } from "./dom.js";
+import { ago, count, duration, interval, percent, short, words } from "./format.js";
+
+const STATE_LOOK = {
+  published: "good", done: "good", ready: "good",
+  rejected: "warn", kept: "warn", cancelled: "warn",
+  failed: "bad",
+  finetuning: "busy", evaluating: "busy", gating: "busy", running: "busy",
+};
+
+export const pill = (state) => element(`span.pill${STATE_LOOK[state] ? `.${STATE_LOOK[state]}` : ""}`, {}, words(state));
+
+export function table(heads, rows, nothing) {
+  if (rows.length === 0) return element("div.empty", {}, nothing);
+  const head = heads.map(([name, look]) => element(`th${look ? `.${look}` : ""}`, { scope: "col" }, name));
+  return element("table", {}, element("thead", {}, element("tr", {}, head)), element("tbody", {}, rows));
+}
+
+const cell = (content, look = "") => element(`td${look}`, {}, content);
+const under = (text) => element("span.under", {}, text);
+
+function tile(name, value, more = "") {
+  return element(
+    "div.tile", {}, element("div.name", {}, name), element("div.value", {}, value), element("div.more", {}, more),
+  );
+}
+
+export function tiles(stats, evaluation) {
+  const { pairs, labels } = stats;
+  const open = [
+    pairs.waiting > 0 ? `${count(pairs.waiting)} being made` : null,
+    pairs.failed > 0 ? `${count(pairs.failed)} failed` : null,
+    `${count(pairs.labelled)} labelled`,
+  ];
+  const rate = (key) => {
+    if (!evaluation) return ["–", "not measured yet"];
+    const range = evaluation.intervals?.[key];
+    return [percent(evaluation[key]), range ? `95 %: ${interval(range)} · n = ${evaluation.n}` : `n = ${evaluation.n}`];
+  };
+  return [
+    tile("Runs", count(stats.episodes), "of all collected policies"),
+    tile("Pairs", count(pairs.ready), open.filter(Boolean).join(" · ")),
+    tile("Labels", count(labels.effective), `${count(labels.new_since_round)} since the last round`),
+    tile("Success, published", ...rate("success")),
+    tile("Alignment, published", ...rate("alignment")),
+    tile("Off the data", ...rate("off_support")),
+  ];
+}
+
+export function annotatorTable(annotators) {
+  const rows = annotators.map((person) => element(
+    "tr", {},
+    cell([person.name, person.kind === "simulated" ? under("simulated") : null]),
+    cell(count(person.labels), ".number"),
+    cell(duration(person.median_duration_ms), ".number"),
+    cell(percent(person.left_share), ".number"),
+  ));
+  const heads = [["Name"], ["Labels", "number"], ["Median time", "number"], ["Chose left", "number"]];
+  return table(heads, rows, "Nobody has labelled yet.");
+}
+
+const ANSWERS = { first: "first run", second: "second run", equal: "equal", cannot_tell: "can’t tell" };
+
+export function answerBars(labels) {
+  const total = Math.max(1, labels.effective);
+  return Object.entries(ANSWERS).map(([choice, name]) => {
+    const number = labels.by_choice?.[choice] ?? 0;
+    return element(
+      "div.answer", {},
+      element("span", {}, name),
+      element("div.meter", {}, element("div", { style: `width:${(100 * number) / total}%` })),
+      element("span.muted", {}, count(number)),
+    );
+  });
+}
+
+export function noiseText(round) {
+  const noise = round?.noise;
+  if (!noise) return null;
+  const parts = Object.entries(noise.estimates ?? {})
+    .filter(([, value]) => typeof value === "number")
+    .map(([name, value]) => `${words(name)} ${percent(value)}`);
+  const origin = noise.source === "given" ? "given" : "estimated from the labels";
+  return element(
+    "p.noise", {},
+    element("strong", {}, `γ = ${noise.conservativeness.toFixed(2)}`), ` in round ${round.id}, ${origin}`,
+    parts.length > 0 ? `. Noise: ${parts.join(", ")}.` : ".",
+  );
+}
+
+const arrow = (before, after, key) =>
+  after ? `${percent(before?.[key])} → ${percent(after[key])}` : "–";
+
+export function roundTable(rounds, selected, { onSelect, onPublish, publishedId }) {
+  const rows = rounds.map((round) => {
+    const { before, after } = round.result ?? {};
+    const mayPublish = round.candidate_checkpoint_id && round.publish_rule !== "never"
+      && ["kept", "rejected"].includes(round.state) && round.candidate_checkpoint_id !== publishedId;
+    return element(
+      `tr${round.id === selected ? ".selected" : ""}`, { dataset: { round: round.id } },
+      cell(element("button.link", { type: "button", onclick: () => onSelect(round.id) }, `Round ${round.id}`)),
+      cell([pill(round.state), round.error ? under(element("span.error-text", {}, round.error)) : null]),
+      cell([round.config.method, under(round.publish_rule === "never" ? "comparison" : words(round.trigger))]),
+      cell(count(round.labels), ".number"),
+      cell(round.noise ? round.noise.conservativeness.toFixed(2) : "–", ".number"),
+      cell(arrow(before, after, "success"), ".number"),
+      cell(arrow(before, after, "alignment"), ".number"),
+      cell(ago(round.created_at), ".tight"),
+      cell(mayPublish ? element("button.button.small", { type: "button", onclick: () => onPublish(round.candidate_checkpoint_id) }, "Publish") : null, ".tight"),
+    );
+  });
+  const heads = [
+    ["Round"], ["State"], ["Method"], ["Labels", "number"], ["γ", "number"],
+    ["Success", "number"], ["Alignment", "number"], ["Started"], [""],
+  ];
+  return table(heads, rows, "No round yet. Collect runs, have them labelled, then start one.");
+}
+
+export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLineage, onPublish, isComparison }) {
+  const rows = checkpoints.map((checkpoint) => {
+    const evaluation = evaluationOf(checkpoint);
+    const rate = (key) => evaluation
+      ? [percent(evaluation[key]), under(interval(evaluation.intervals?.[key]))] : "–";
+    const published = checkpoint.id === publishedId;
+    return element(
+      "tr", { dataset: { checkpoint: checkpoint.id } },
+      cell([checkpoint.name, under(element("code", {}, short(checkpoint.digest)))]),
+      cell(published ? element("span.pill.good", {}, "published") : isComparison(checkpoint) ? element("span.pill", {}, "comparison") : null),
+      cell(rate("success"), ".number"), cell(rate("alignment"), ".number"), cell(rate("off_support"), ".number"),
+      cell(ago(checkpoint.created_at), ".tight"),
+      cell([
+        element("button.button.small", { type: "button", onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
+        published || isComparison(checkpoint) ? null
+          : element("button.button.small", { type: "button", onclick: () => onPublish(checkpoint.id) }, "Publish"),
+      ], ".tight"),
+    );
+  });
+  const heads = [["Checkpoint"], [""], ["Success", "number"], ["Alignment", "number"], ["Off the data", "number"], ["Made"], [""]];
+  return table(heads, rows, "No checkpoint.");
+}
+
+export function jobTable(jobs, { onRetry }) {
+  const rows = jobs.map((job) => element(
+    "tr", { dataset: { job: job.id } },
+    cell(`${words(job.kind)} ${job.id}`),
+    cell([pill(job.state), job.error ? under(element("span.error-text", {}, job.error)) : null]),
+    cell([job.stage, job.state === "running" ? under(percent(job.progress)) : null]),
+    cell(job.attempt, ".number"),
+    cell(ago(job.finished_at ?? job.started_at ?? job.created_at), ".tight"),
+    cell(job.state === "failed" ? element("button.button.small", { type: "button", onclick: () => onRetry(job) }, "Retry") : null, ".tight"),
+  ));
+  return table([["Job"], ["State"], ["Stage"], ["Attempts", "number"], ["When"], [""]], rows, "Nothing is waiting, running or failed.");
+}
+
+export function pairCards(pairs) {
+  return pairs.map((pair) => element(
+    "figure.pair", { dataset: { pair: pair.id } },
+    pair.thumbnail_url
+      ? element("img", { src: pair.thumbnail_url, loading: "lazy", alt: `Paths of pair ${pair.id}` })
+      : element("div.blank", {}, words(pair.state)),
+    element("figcaption", {}, element("span", {}, `Pair ${pair.id}`), element("span", {}, words(pair.reason))),
+  ));
+}
+
+export function lineageList(steps) {
+  return element(
+    "ol.lineage", {},
+    steps.map((step) => {
+      const people = step.labels_by_annotator.map((item) => `${item.name} ${item.labels}`).join(", ");
+      const method = step.config?.method;
+      return element(
+        "li", {},
+        element("strong", {}, step.checkpoint.name), " ", element("code.muted", {}, short(step.checkpoint.digest)),
+        step.round_id === null
+          ? element("p.muted.small", {}, "pretrained, no labels behind it")
+          : element("p.muted.small", {}, `Round ${step.round_id}, ${method}, configuration ${short(step.config_digest)}`),
+        step.round_id === null ? null
+          : element("p.muted.small", {}, `${step.label_ids.length} labels (snapshot ${short(step.snapshot_digest)}): ${people}`),
+        element("p.muted.small", {}, `code version ${step.code_version}`),
+      );
+    }),
+  );
+}
