@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 from types import TracebackType
 from typing import Any
 
+from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
@@ -19,7 +20,7 @@ from server.errors import LeaseLostError
 from server.states import JobKind
 from server.store import jobs
 from server.store.events import add_event
-from server.store.tables import Job
+from server.store.tables import Event, Job
 from worker.workbench import Workbench
 
 logger = logging.getLogger(__name__)
@@ -70,7 +71,8 @@ class Attempt:
         self._thread = threading.Thread(target=self._keep, name="heart-beat", daemon=True)
         self._shown_at = float("-inf")  # monotonic clock of the last progress write
         self._shown_stage = ""
-        self._curve: list[dict[str, Any]] = []
+        self._curve: list[dict[str, Any]] = []  # points not stored yet
+        self._shown_points: dict[str, tuple[int, float]] | None = None
 
     def __enter__(self) -> Attempt:
         self._thread.start()
@@ -109,13 +111,13 @@ class Attempt:
     def progress(
         self, stage: str, fraction: float, metrics: dict[str, float] | None = None
     ) -> None:
-        """Show how far the job is (0 … 1); `metrics` become one point of the round's curves.
+        """Show how far the stage is (0 … 1); `metrics` become one point of the round's curves.
 
         Writes at most every half second, and at once when the stage changes.
         """
         self._check()
         if metrics:
-            self._curve.append({"stage": stage, "fraction": fraction, **metrics})
+            self._add_point(stage, fraction, metrics)
         now = time.monotonic()
         if stage == self._shown_stage and now - self._shown_at < PROGRESS_SECONDS:
             return
@@ -132,6 +134,23 @@ class Attempt:
             self._write_curve(session)
             self._tell(session, fraction, stage)
         self._curve = []
+
+    def _add_point(self, stage: str, fraction: float, metrics: dict[str, float]) -> None:
+        """Next point of a stage's curve, unless an earlier attempt has shown it already."""
+        if self._shown_points is None:
+            self._shown_points = self._points_of_earlier_attempts()
+        step, reached = self._shown_points.get(stage, (0, -1.0))
+        if fraction > reached:
+            self._shown_points[stage] = (step + 1, fraction)
+            point = {"stage": stage, "step": step + 1, "fraction": fraction}
+            self._curve.append(point | metrics)
+
+    def _points_of_earlier_attempts(self) -> dict[str, tuple[int, float]]:
+        """Step and fraction of the last stored point of each stage."""
+        query = select(Event.data).where(Event.job_id == self.facts.id, Event.kind == "curve")
+        with self.bench.database.read() as session:
+            points = session.scalars(query.order_by(Event.id)).all()
+        return {point["stage"]: (point["step"], point["fraction"]) for point in points}
 
     def event(self, session: Session, kind: str, data: dict[str, Any]) -> None:
         """Append an event of this job to the stream that browsers follow."""

@@ -196,6 +196,31 @@ def test_progress_writes_at_most_every_half_second_and_keeps_every_curve_point(
     events = world.rows(Event)
     shown = [e.data["progress"] for e in events if e.kind == "job"]
     assert shown == [0.0, 0.5, 1.0, 1.0]
-    assert [e.data["loss"] for e in events if e.kind == "curve"] == [float(i) for i in range(101)]
+    points = [e.data for e in events if e.kind == "curve"]
+    assert [(p["step"], p["loss"]) for p in points] == [(i + 1, float(i)) for i in range(101)]
     job = world.rows(Job)[0]
     assert (job.progress, job.state) == (1.0, JobState.DONE)
+
+
+def test_curve_goes_on_without_repeats_when_an_attempt_is_taken_up_again(world: World) -> None:
+    job_id = world.enqueue_collect()
+    first = running._claim(world.bench, job_id)
+    assert first is not None
+    for update in (1, 2, 3):
+        first.progress("updates", update / 6, {"loss": 1 / update})
+        first._shown_at = float("-inf")  # let every point be written at once
+    world.clock.advance(61)
+    second = running._claim(world.bench, job_id)
+    assert second is not None
+    for update in (2, 3, 4, 5):  # from the last saved state on
+        second.progress("updates", update / 6, {"loss": 1 / update})
+    with second.step() as session:
+        second.finish(session, {})
+    points = [e.data for e in world.rows(Event) if e.kind == "curve"]
+    assert [(p["step"], p["loss"]) for p in points] == [
+        (1, 1.0),
+        (2, 0.5),
+        (3, 1 / 3),
+        (4, 0.25),
+        (5, 0.2),
+    ]

