@@ -1,0 +1,92 @@
+"""The command line itself: quick help, clear errors, and the commands that need no server."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
+from tests.core.learning import tiny_checkpoint
+from worker.cli.main import main
+from worker.cli.options import number_list
+
+
+def test_help_loads_no_simulator_and_no_network_library():
+    code = (
+        "import sys; from worker.cli.main import build_parser; build_parser().format_help();"
+        "print(sorted({'torch', 'mujoco', 'viser', 'celery', 'rich'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_unknown_command_names_the_legal_ones(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as caught:
+        main(["fly"])
+    assert caught.value.code == 2
+    assert "invalid choice: 'fly'" in capsys.readouterr().err
+
+
+def test_evaluate_prints_rates_and_intervals_of_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = tmp_path / "tiny.safetensors"
+    file.write_bytes(save_checkpoint(tiny_checkpoint()))
+    assert main(["evaluate", str(file), "--n", "3", "--seed", "7", "--json"]) == 0
+    measured = json.loads(capsys.readouterr().out)
+    assert measured["checkpoint"] == tiny_checkpoint().digest
+    assert measured["n"] == 3
+    assert 0 <= measured["intervals"]["success"][0] <= measured["success"] <= 1
+    assert main(["evaluate", str(file), "--n", "3", "--seed", "7"]) == 0
+    assert "off-support" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "neither a readable file"),
+        (b"not a checkpoint", "rodif evaluate: "),
+    ],
+)
+def test_evaluate_refuses_what_is_no_checkpoint(
+    content: bytes | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = tmp_path / "broken.safetensors"
+    if content is not None:
+        file.write_bytes(content)
+    assert main(["evaluate", str(file)]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_evaluate_names_the_legal_number_of_rollouts(capsys: pytest.CaptureFixture[str]):
+    assert main(["evaluate", "avoid", "--n", "0"]) == 1
+    assert "episodes is 0, but must be 1 … 100000" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_pretrain_writes_a_checkpoint_with_its_measurements(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = tmp_path / "deep" / "new.safetensors"
+    sizes = ["--demonstrations", "24", "--updates", "3", "--evaluate", "4"]
+    assert main(["pretrain", "avoid", "--out", str(file), *sizes, "--seed", "5"]) == 0
+    made = load_checkpoint(file.read_bytes())
+    assert made.card["evaluation"]["n"] == 4
+    assert made.card["demonstrations"] == 24
+    assert made.digest in capsys.readouterr().out
+
+
+def test_number_list_takes_numbers_and_ranges():
+    assert number_list("7") == [7]
+    assert number_list("100-102,7") == [100, 101, 102, 7]
+
+
+@pytest.mark.parametrize("text", ["", "x", "5-", "5-3", "1,,2"])
+def test_number_list_refuses_anything_else(text: str):
+    with pytest.raises(argparse.ArgumentTypeError):
+        number_list(text)
