@@ -1,0 +1,68 @@
+"""`rodif demo --headless`, small: the whole loop in a process tree of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+SIZES = {
+    "episodes": 40,
+    "pairs": 60,
+    "labels": 30,
+    "annotators": 3,
+    "flip-rate": 0.2,
+    "evaluation-episodes": 60,
+    "comparison-updates": 2,
+}
+RATES = ("success", "alignment", "alignment_of_successes", "off_support")
+
+
+def test_headless_demo_writes_the_table_and_leaves_nothing_running(tmp_path: Path):
+    table, state = tmp_path / "out.json", tmp_path / "state"
+    sizes = [part for name, value in SIZES.items() for part in (f"--{name}", str(value))]
+    command = [sys.executable, "-m", "worker.cli.main", "demo", "--headless"]
+    done = subprocess.run(
+        [*command, "--json", table, "--state", state, *sizes],
+        env=os.environ | {"RODIF_ARGON2_CHEAP": "true"},
+        capture_output=True,
+        text=True,
+    )
+    told = done.stdout + done.stderr
+    assert table.exists(), told
+    result = json.loads(table.read_text())
+    for name in ("before", "after", "rodif", "dp_dpo"):
+        assert all(0 <= result[name][rate] <= 1 for rate in RATES), name
+        assert result[name]["n"] == 60
+    assert result["labels"]["total"] == 30
+    assert result["labels"]["flipped"] == 6
+    assert {"start", "collect", "replays", "labels", "rounds", "total"} <= set(result["seconds"])
+    # So few labels may steer too little for the demo's own bar; that it steers is certain.
+    before, after = result["before"], result["after"]
+    assert after["alignment"] > before["alignment"], told
+    shown = (
+        after["alignment"] - before["alignment"] >= 0.30
+        and after["success"] >= before["success"]
+        and result["round"]["state"] == "published"
+    )
+    assert done.returncode == (0 if shown else 1), told
+    left = [p for p in psutil.process_iter(["cmdline"]) if str(state) in str(p.info["cmdline"])]
+    assert left == []
+
+
+def test_demo_refuses_a_folder_in_use(tmp_path: Path):
+    (tmp_path / "something").touch()
+    done = subprocess.run(
+        [sys.executable, "-m", "worker.cli.main", "demo", "--state", tmp_path],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert "wants an empty folder" in done.stderr
