@@ -117,7 +117,7 @@ def list_annotators(session: Session) -> Sequence[Annotator]:
 def labels_per_annotator(session: Session) -> dict[int, int]:
     """Labels in force by annotator id."""
     query = select(Label.annotator_id, func.count()).where(is_effective())
-    return dict(session.execute(query.group_by(Label.annotator_id)).tuples().all())
+    return dict(session.execute(query.group_by(Label.annotator_id)).all())
 
 
 def issue_token(

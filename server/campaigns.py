@@ -235,7 +235,7 @@ def _label_counts(session: Session, campaign_id: int) -> dict[str, Any]:
     query = select(Label.choice, func.count()).where(
         Label.campaign_id == campaign_id, is_effective()
     )
-    found = dict(session.execute(query.group_by(Label.choice)).tuples().all())
+    found = dict(session.execute(query.group_by(Label.choice)).all())
     by_choice = {choice.value: found.get(choice.value, 0) for choice in Choice}
     return {
         "total": total,
@@ -283,6 +283,6 @@ def _share(flags: list[bool]) -> float | None:
 
 def _job_counts(session: Session, campaign_id: int) -> dict[str, int]:
     query = select(Job.state, func.count()).where(Job.campaign_id == campaign_id)
-    found = dict(session.execute(query.group_by(Job.state)).tuples().all())
+    found = dict(session.execute(query.group_by(Job.state)).all())
     shown = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
     return {state.value: found.get(state.value, 0) for state in shown}

@@ -60,9 +60,7 @@ def add_me(session: Session, name: str, kind: AnnotatorKind = AnnotatorKind.PERS
 
 def add_token(session: Session, annotator_id: int, days: float = 30) -> str:
     """A bearer token of the account."""
-    return issue_token(
-        session, NOW, annotator_id=annotator_id, name="test", days=days, by=None
-    )[1]
+    return issue_token(session, NOW, annotator_id=annotator_id, name="test", days=days, by=None)[1]
 
 
 def add_checkpoint(

@@ -139,7 +139,8 @@ def submit_label(
     response: Response,
 ) -> LabelOut:
     """Store an answer, for ever."""
-    submission = labeling.Submission(**{name: getattr(body, name) for name in body.model_fields})
+    names = LabelCreate.model_fields
+    submission = labeling.Submission(**{name: getattr(body, name) for name in names})
     label, created = labeling.submit_label(
         session, services.clock(), me, submission, idempotency_key=key
     )
@@ -216,7 +217,7 @@ def count_truth(campaign_id: PathId, _me: Staff, session: ReadSession) -> TruthC
         .where(Label.campaign_id == campaign_id)
         .group_by(SimulatedTruth.corrupted)
     )
-    counts = dict(session.execute(known).tuples().all())
+    counts = dict(session.execute(known).all())
     return TruthCounts(total=sum(counts.values()), flipped=counts.get(True, 0))
 
 

@@ -29,18 +29,14 @@ def _rounds_out(session: Session, rows: Sequence[Round]) -> list[RoundOut]:
             select(Checkpoint.round_id, Checkpoint.id).where(
                 Checkpoint.round_id.in_([row.id for row in rows])
             )
-        )
-        .tuples()
-        .all()
+        ).all()
     )
     sizes = dict(
         session.execute(
             select(LabelSnapshot.digest, LabelSnapshot.size).where(
                 LabelSnapshot.digest.in_({row.snapshot_digest for row in rows})
             )
-        )
-        .tuples()
-        .all()
+        ).all()
     )
     extra = ("candidate_checkpoint_id", "labels")
     names = [name for name in RoundOut.model_fields if name not in extra]

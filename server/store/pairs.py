@@ -80,5 +80,5 @@ def count_taken(session: Session, now: datetime, pair_id: int, annotator_id: int
 def count_by_state(session: Session, campaign_id: int) -> dict[PairState, int]:
     """Number of pairs in each state."""
     query = select(Pair.state, func.count()).where(Pair.campaign_id == campaign_id)
-    counts = dict(session.execute(query.group_by(Pair.state)).tuples().all())
+    counts = dict(session.execute(query.group_by(Pair.state)).all())
     return {state: counts.get(state.value, 0) for state in PairState}

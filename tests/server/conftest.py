@@ -115,9 +115,7 @@ def engine_name(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def empty_url(
-    engine_name: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> Iterator[str]:
+def empty_url(engine_name: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[str]:
     """Address of an empty database."""
     if engine_name == "sqlite":
         yield f"sqlite:///{tmp_path / 'empty.sqlite3'}"
@@ -129,9 +127,7 @@ def empty_url(
 
 
 @pytest.fixture
-def database_url(
-    engine_name: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> Iterator[str]:
+def database_url(engine_name: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[str]:
     """Address of a database with all tables and no rows."""
     if engine_name == "sqlite":
         path = tmp_path / "rodif.sqlite3"

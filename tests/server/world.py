@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ class World:
     sent: list[tuple[int, JobKind]]
     tokens: dict[str, str] = field(default_factory=dict)
     ids: dict[str, int] = field(default_factory=dict)
+    numbers: Iterator[int] = field(default_factory=itertools.count)
 
     def client(self, name: str | None = None) -> TestClient:
         """A client with the bearer token of the account, or without any."""
@@ -67,7 +69,7 @@ class World:
     ) -> tuple[int, list[int]]:
         """A campaign with ready pairs; gives their ids."""
         with self.database.write() as session:
-            name = f"campaign {len(self.sent)} {settings} {pairs}"
+            name = f"campaign {next(self.numbers)}"
             campaign = factories.add_campaign(session, name, **settings)
             made = []
             if pairs:
