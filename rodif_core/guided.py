@@ -31,7 +31,7 @@ from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.preferences.pairs import Preference
 from rodif_core.rollout import rollout
-from rodif_core.scoring import PathUtility, path_features, split_threshold, standardise
+from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Scorer
 from rodif_core.trajectory import Trajectory
 
@@ -51,11 +51,14 @@ class Scores:
     kept: list[int]
     path_utility: PathUtility
     path_threshold: float
+    network_threshold: float
+    eligible: NDArray[np.bool_]  # (R,): may be a winner
 
     def to_json(self) -> dict[str, Any]:
-        """What the round stores; agreement = share of trajectories both place on one side."""
-        network_side = self.network > split_threshold(self.network)
-        path_side = self.gaussian_process > self.path_threshold
+        """What the round stores; agreement = share of eligible trajectories that both models
+        place on the same side of their cuts."""
+        network_side = self.network[self.eligible] > self.network_threshold
+        path_side = self.gaussian_process[self.eligible] > self.path_threshold
         return {
             "network": [round(float(value), 4) for value in self.network],
             "gaussian_process": [round(float(value), 4) for value in self.gaussian_process],
@@ -144,19 +147,23 @@ def score(
     )  # fmt: skip
     ratios = compute_ratios(moved.policy, transitions, config)
     network = np.asarray(mean_ratio_per_trajectory(ratios, transitions))
-    path_utility = PathUtility.fit(path_features(trajectories), preferences)
+    path_utility = PathUtility.fit(PathFeatures.of(trajectories), preferences)
     opinions = {
         Scorer.NETWORK: standardise(network),
         Scorer.GAUSSIAN_PROCESS: standardise(path_utility.utilities),
         Scorer.COMBINED: standardise(network) + standardise(path_utility.utilities),
     }
     used = opinions[config.guide.scorer]
-    threshold = split_threshold(used)
-    kept = [i for i in range(len(used)) if used[i] > threshold]
-    if config.guide.require_success:
-        kept = [i for i in kept if trajectories[i].success]
-    if not kept:
-        raise LearningError("no successful trajectory scores above the cut; more labels are needed")
+    # Failures are out of the question as winners; the cut runs between the others.
+    success = np.array([trajectory.success for trajectory in trajectories])
+    eligible = success | (not config.guide.require_success)
+    if eligible.sum() < 2:
+        raise LearningError(
+            f"{int(eligible.sum())} of {len(eligible)} labelled trajectories succeeded; "
+            "guidance needs at least 2: collect more episodes"
+        )
+    threshold = split_threshold(used[eligible])
+    kept = np.flatnonzero(eligible & (used > threshold)).tolist()
     return Scores(
         network,
         path_utility.utilities,
@@ -164,7 +171,9 @@ def score(
         threshold,
         kept,
         path_utility,
-        split_threshold(path_utility.utilities),
+        split_threshold(path_utility.utilities[eligible]),
+        split_threshold(network[eligible]),
+        eligible,
     )
 
 
@@ -213,7 +222,7 @@ def _fresh(
 
 
 def _liked(rollouts: Sequence[Trajectory], scores: Scores) -> NDArray[np.bool_]:
-    predicted = scores.path_utility.predict(path_features(rollouts)) > scores.path_threshold
+    predicted = scores.path_utility.predict(PathFeatures.of(rollouts)) > scores.path_threshold
     liked: NDArray[np.bool_] = predicted & np.asarray([t.success for t in rollouts])
     return liked
 

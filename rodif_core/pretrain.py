@@ -164,7 +164,10 @@ def _train(
         optimizer.step()
         _update_average(average, model, min(config.ema_decay, (1 + update) / (10 + update)))
         if update % REPORT_EVERY == 0 or update == config.updates - 1:
-            metrics = {"loss": float(loss.detach()), "held_out": _held_out_loss(policy, average, held_out)}
+            metrics = {
+                "loss": float(loss.detach()),
+                "held_out": _held_out_loss(policy, average, held_out),
+            }
             if not math.isfinite(metrics["loss"]):
                 raise LearningError(f"the loss became {metrics['loss']} at update {update}")
             curve.append({"update": float(update), **metrics})

@@ -93,7 +93,9 @@ def _rollout_batch(checkpoint: Checkpoint, task: Task, seeds: list[int]) -> list
         observations = env.step(actions)
         qpos, paths = env.qpos, env.paths
         for i in active:
-            records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i])
+            # A step in which the physics diverged never happened: its state is not finite.
+            if env.steps[i] > step:
+                records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i])
         step += 1
     outcomes = env.outcomes()
     return [

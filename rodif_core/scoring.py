@@ -6,9 +6,9 @@ hardly better than a coin. Two models share strength between trajectories:
 * the network: a few full-batch RoDiF updates on a throw-away copy of the policy; a trajectory's
   utility is its mean log-ratio. Needs no features.
 * the Gaussian process: Bradley-Terry utilities with a Gaussian-process prior over the
-  end-effector path. Also predicts the utility of paths that nobody has seen.
+  end-effector path and the outcome. Also predicts the utility of paths that nobody has seen.
 
-Legend: R trajectories, M preferences, F features of a path.
+Legend: R trajectories, M preferences, P points of a path.
 """
 
 from __future__ import annotations
@@ -25,48 +25,61 @@ from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-PATH_POINTS = 16  # points of a path, evenly spaced in time, that make its features
-PRIOR_SD = 1.0  # of the utilities, in Bradley-Terry log-odds
-JITTER = 1e-6  # on the kernel's diagonal, for the Cholesky factor
+PATH_POINTS = 16  # P, evenly spaced along the path
+PRIOR_SD = 0.5  # of the utilities within one outcome, in Bradley-Terry log-odds
+OUTCOME_VARIANCE = 0.5  # of the common utility of successes (or failures), in units of PRIOR_SD²
+SCALE_FACTOR = 2.0  # length scale of each point's kernel, in median distances of that point
+JITTER = 1e-6  # on the kernel's diagonal, for its inverse
 NEWTON_STEPS = 50
 TOLERANCE = 1e-9  # largest change of a utility that still counts as movement
 
 
-def path_features(trajectories: Sequence[Trajectory]) -> Array:
-    """End-effector paths at PATH_POINTS moments: (R, 3 * PATH_POINTS) in metres."""
-    rows = []
-    for trajectory in trajectories:
-        steps = np.linspace(0, len(trajectory.paths) - 1, PATH_POINTS).round().astype(int)
-        rows.append(trajectory.paths[steps].astype(np.float64).ravel())
-    return np.stack(rows)
+@dataclass(frozen=True, eq=False)
+class PathFeatures:
+    """What the Gaussian process sees: points (R, P, 3) in metres, success (R,) bool."""
+
+    points: Array
+    success: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, trajectories: Sequence[Trajectory]) -> PathFeatures:
+        """End-effector paths at PATH_POINTS places, evenly spaced along their length."""
+        rows = []
+        for trajectory in trajectories:
+            path = trajectory.paths.astype(np.float64)
+            length = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+            places = np.linspace(0, length[-1], PATH_POINTS)
+            rows.append(path[np.searchsorted(length, places).clip(max=len(path) - 1)])
+        return cls(np.stack(rows), np.array([trajectory.success for trajectory in trajectories]))
 
 
 @dataclass(frozen=True, eq=False)
 class PathUtility:
-    """Posterior mode of Bradley-Terry utilities under a Gaussian-process prior on paths.
+    """Posterior mode of Bradley-Terry utilities under a Gaussian-process prior.
 
-    features (R, F) of the labelled trajectories; utilities (R,); weights (R,) = K⁻¹ utilities.
+    The kernel adds up over the points of the path, so that a criterion about one stretch of it
+    is learned from few labels, and it joins successes with successes and failures with failures
+    only: what makes a good run good says little about a failed one.
+
+    scales (P,) metres; utilities (R,); weights (R,) = K⁻¹ utilities.
     """
 
-    features: Array
-    length_scale: float
+    features: PathFeatures
+    scales: Array
     utilities: Array
     weights: Array
 
     @classmethod
-    def fit(cls, features: Array, preferences: Sequence[Preference]) -> PathUtility:
+    def fit(cls, features: PathFeatures, preferences: Sequence[Preference]) -> PathUtility:
         """Newton's method on the concave log-posterior; deterministic.
 
-        The length scale is the median distance between paths. Raises LearningError without
-        preferences.
+        Raises LearningError without preferences.
         """
         if not preferences:
             raise LearningError("no label prefers one trajectory over another; label some pairs")
-        distances = _distances(features, features)
-        positive = distances[distances > 0]
-        length_scale = float(np.median(positive)) if len(positive) else 1.0
-        count = len(features)
-        kernel = _kernel(distances, length_scale) + JITTER * np.eye(count)
+        scales = SCALE_FACTOR * _median_distances(features.points)
+        count = len(features.points)
+        kernel = _kernel(features, features, scales) + JITTER * np.eye(count)
         precision = np.linalg.inv(kernel)
         design = np.zeros((len(preferences), count))
         rows = np.arange(len(preferences))
@@ -81,12 +94,11 @@ class PathUtility:
             utilities = utilities + step
             if np.abs(step).max() < TOLERANCE:
                 break
-        return cls(features, length_scale, utilities, precision @ utilities)
+        return cls(features, scales, utilities, precision @ utilities)
 
-    def predict(self, features: Array) -> Array:
-        """Posterior-mode utility of other paths: (R', F) → (R',)."""
-        kernel = _kernel(_distances(features, self.features), self.length_scale)
-        predicted: Array = kernel @ self.weights
+    def predict(self, features: PathFeatures) -> Array:
+        """Posterior-mode utility of other paths → (R',)."""
+        predicted: Array = _kernel(features, self.features, self.scales) @ self.weights
         return predicted
 
 
@@ -114,11 +126,19 @@ def split_threshold(scores: Array) -> float:
     return cut
 
 
-def _distances(a: Array, b: Array) -> Array:
-    result: Array = np.sqrt(((a[:, None] - b[None]) ** 2).sum(-1))
-    return result
+def _median_distances(points: Array) -> Array:
+    """Median distance between two different trajectories at each point (P,), in metres."""
+    medians = []
+    for place in points.transpose(1, 0, 2):
+        distances = np.linalg.norm(place[:, None] - place[None], axis=-1)
+        positive = distances[distances > 0]
+        medians.append(np.median(positive) if len(positive) else 1.0)
+    return np.array(medians)
 
 
-def _kernel(distances: Array, length_scale: float) -> Array:
-    result: Array = PRIOR_SD**2 * np.exp(-0.5 * (distances / length_scale) ** 2)
+def _kernel(a: PathFeatures, b: PathFeatures, scales: Array) -> Array:
+    squared = ((a.points[:, None] - b.points[None]) ** 2).sum(-1)
+    alike = np.exp(-0.5 * squared / scales**2).mean(-1)
+    same_outcome = a.success[:, None] == b.success[None]
+    result: Array = PRIOR_SD**2 * same_outcome * (alike + OUTCOME_VARIANCE)
     return result

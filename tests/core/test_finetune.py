@@ -17,7 +17,7 @@ from rodif_core.guidance import guidance_target, guide
 from rodif_core.guided import Trial, choose
 from rodif_core.log_ratio import PairMatrix, Transitions
 from rodif_core.preferences.pairs import Preference
-from rodif_core.scoring import PathUtility, path_features, split_threshold, standardise
+from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, GuideConfig
 from tests.core.learning import chain_trajectory, tiny_checkpoint, tiny_policy
 
@@ -136,16 +136,17 @@ def test_guidance_without_winners_says_what_to_do() -> None:
 
 
 def test_path_utility_of_two_paths_matches_hand_worked_number() -> None:
-    # Two far-apart paths have an (almost) diagonal prior. With n labels for the first, the mode
-    # is symmetric, u_0 = -u_1 = u, and solves u = n (1 - σ(2u)) / (1 + off-diagonal terms);
-    # the median distance is the length scale, so the kernel's off-diagonal is exp(-1/2).
-    features = np.array([[0.0, 0.0], [3.0, 4.0]])
+    # One point per path: the median distance is their distance d, the scale 2d, so the kernel's
+    # off-diagonal is exp(-1/8) and K = 0.25 [[1.5, c], [c, 1.5]] with c = exp(-1/8) + 0.5.
+    # By symmetry u_0 = -u_1 = u, and K⁻¹ (u, -u) = (u, -u) / (0.25 (1.5 - c)), so that with four
+    # labels u / (0.25 (1 - exp(-1/8))) = 4 (1 - σ(2u)).
+    points = np.array([[[0.0, 0.0, 0.0]], [[3.0, 4.0, 0.0]]])
+    features = PathFeatures(points, np.array([True, True]))
     fit = PathUtility.fit(features, [Preference(0, 1)] * 4)
-    rho = np.exp(-0.5)
     u = fit.utilities[0]
+    variance = 0.25 * (1 - np.exp(-1 / 8))
     assert fit.utilities[1] == pytest.approx(-u)
-    # K⁻¹ (u, -u) = (u, -u) / (1 - rho), hence u / (1 - rho) = 4 (1 - σ(2u)).
-    assert u / (1 - rho + 1e-6) == pytest.approx(4 * (1 - 1 / (1 + np.exp(-2 * u))), rel=1e-4)
+    assert u / variance == pytest.approx(4 * (1 - 1 / (1 + np.exp(-2 * u))), rel=1e-4)
     assert fit.predict(features) == pytest.approx(fit.utilities, abs=1e-4)
 
 
@@ -162,9 +163,15 @@ def test_path_utility_recovers_the_side_from_sparse_noisy_labels() -> None:
         if rng.random() < 0.3:
             winner, loser = loser, winner
         preferences.append(Preference(winner, loser))
-    utilities = PathUtility.fit(path_features(trajectories), preferences).utilities
+    utilities = PathUtility.fit(PathFeatures.of(trajectories), preferences).utilities
     above = utilities > split_threshold(utilities)
     assert (above == np.array([x < 0.5 for x in sides])).mean() > 0.9
+
+
+def test_path_features_are_evenly_spaced_along_the_path() -> None:
+    points = PathFeatures.of([chain_trajectory(tiny_policy(), 9, seed=0, x=0.4)]).points[0]
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert steps.max() < 1.6 * steps.min()
 
 
 def test_split_threshold_does_not_depend_on_the_share_of_good_ones() -> None:
