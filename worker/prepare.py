@@ -16,6 +16,7 @@ from typing import Any
 
 from sqlalchemy import select
 
+from rodif_core.errors import CheckpointFileError
 from rodif_core.spec import TaskName
 from server.bootstrap import ensure_admin, register_checkpoint
 from server.campaigns import create_campaign
@@ -60,8 +61,18 @@ def prepare(settings: Settings, *, admin_password: str | None = None) -> Prepare
 
 
 def shipped_bytes(task: TaskName) -> bytes:
-    """The pretrained checkpoint that comes with the package, read without torch."""
-    return (resources.files("rodif_core") / "checkpoints" / f"{task}.safetensors").read_bytes()
+    """The pretrained checkpoint that comes with the package, read without torch.
+
+    Raises CheckpointFileError when it is missing.
+    """
+    file = resources.files("rodif_core") / "checkpoints" / f"{task}.safetensors"
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        raise CheckpointFileError(
+            f"no checkpoint is shipped for task {task.value!r}: {file} is missing;"
+            " install the project again"
+        ) from None
 
 
 def register_shipped(settings: Settings, database: Database, task: TaskName) -> int:

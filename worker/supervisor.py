@@ -20,16 +20,18 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import IO
 
 import psutil
-from sqlalchemy import delete
+from sqlalchemy import delete, update
 
 from rodif_core.errors import ValueOutOfRangeError
 from server.settings import Settings
+from server.states import JobState
 from server.store.session import Database
-from server.store.tables import ServiceBeat
+from server.store.tables import Job, ServiceBeat
 from worker import leash
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
 from worker.prepare import Prepared, prepare
@@ -40,6 +42,7 @@ from worker.processes import (
     embedded_services,
     socket_path,
 )
+from worker.workbench import utc_now
 
 logger = logging.getLogger(__name__)
 
@@ -254,7 +257,7 @@ def running_system(
         system = System(settings, prepare(settings, admin_password=admin_password))
         try:
             if socket_path(settings) is not None:
-                _forget_old_beats(settings)
+                take_over(settings, utc_now())
                 _start_broker(system)
             for service in embedded_services(settings, workers):
                 system.start(service)
@@ -295,12 +298,18 @@ def _free_port(settings: Settings) -> int:
         return int(probe.getsockname()[1])
 
 
-def _forget_old_beats(settings: Settings) -> None:
-    """Signs of life of the last run would make a system look ready that is not."""
+def take_over(settings: Settings, now: datetime) -> None:
+    """Forget what the last run of this state folder left in the database.
+
+    Its signs of life would make a system look ready that is not, and its leases would let
+    interrupted jobs wait: whoever held them is gone, since the folder is ours.
+    """
     database = Database(settings.database_url)
     try:
         with database.write() as session:
             session.execute(delete(ServiceBeat))
+            interrupted = update(Job).where(Job.state == JobState.RUNNING)
+            session.execute(interrupted.values(lease_expires_at=now - timedelta(seconds=1)))
     finally:
         database.dispose()
 

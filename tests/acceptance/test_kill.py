@@ -53,6 +53,20 @@ def test_collect_completes_without_duplicates_when_the_worker_is_killed(site: Si
     )
 
 
+def test_work_goes_on_when_the_broker_is_killed(site: Site) -> None:
+    before = len(site.rows(Episode))
+    collect = {"episodes": 25, "pairs": 1, "strategy": "random"}
+    first = site.post("/collect", collect)["id"]
+    wait_for(lambda: site.rows(Job, id=first)[0].state == JobState.RUNNING, "the job runs")
+    kill_tree(site.system.pid("broker"))
+    second = site.post("/collect", collect)["id"]  # the row is stored whatever the broker does
+    for job_id in (first, second):
+        site.api.wait_for_job(job_id, seconds=90)
+    seeds = Counter(episode.seed for episode in site.rows(Episode))
+    assert seeds == Counter(range(before + 50))
+    wait_for(lambda: site.system.not_ready() is None, "all parts are ready again")
+
+
 def test_finetune_completes_with_one_checkpoint_when_the_worker_is_killed(site: Site) -> None:
     site.label_pairs(PAIRS)
     config = {"method": "rodif", "updates": UPDATES, "conservativeness": 0.3, "vote_scale": 1.4}

@@ -15,9 +15,11 @@ import psutil
 import pytest
 
 from rodif_core.errors import ValueOutOfRangeError
+from server.errors import LeaseLostError
 from server.settings import Settings
-from server.store.migrate import upgrade
-from worker import supervisor
+from server.store.beats import BEAT, last_beat, record_beat
+from tests.worker.rows import make_world
+from worker import running, supervisor
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
 from worker.prepare import Prepared
 from worker.processes import Service, socket_path
@@ -182,17 +184,17 @@ def test_foreign_process_with_the_number_of_a_dead_broker_is_spared(tmp_path: Pa
     end_orphan_broker(pid_file)
 
 
-def test_old_signs_of_life_do_not_count_as_ready(tmp_path: Path) -> None:
-    from server.store.beats import BEAT, last_beat, record_beat
-    from server.store.session import Database
-    from worker.workbench import utc_now
-
-    settings = _settings(tmp_path)
-    upgrade(settings.database_url)
-    database = Database(settings.database_url)
-    with database.write() as session:
-        record_beat(session, utc_now(), BEAT)
-    supervisor._forget_old_beats(settings)
-    with database.read() as session:
+def test_take_over_forgets_old_signs_of_life_and_frees_interrupted_jobs(tmp_path: Path) -> None:
+    world = make_world(tmp_path)
+    job_id = world.enqueue_collect()
+    with world.bench.database.write() as session:
+        record_beat(session, world.clock(), BEAT)
+    dead = running._claim(world.bench, job_id)
+    assert dead is not None
+    assert running._claim(world.workbench("worker-2"), job_id) is None
+    supervisor.take_over(world.settings, world.clock())
+    with world.bench.database.read() as session:
         assert last_beat(session, BEAT) is None
-    database.dispose()
+    assert running._claim(world.workbench("worker-2"), job_id) is not None
+    with pytest.raises(LeaseLostError):
+        dead.progress("rollouts", 0.5)

@@ -1,0 +1,95 @@
+"""Preparing a database: once or twice, with and without a password, with a newer checkpoint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rodif_core.policies.checkpoint import (
+    CheckpointFileError,
+    load_checkpoint,
+    save_checkpoint,
+    shipped_checkpoint,
+)
+from rodif_core.spec import TaskName
+from server.settings import Settings
+from server.store.session import Database
+from server.store.tables import Annotator, Campaign, Checkpoint
+from tests.core.learning import tiny_checkpoint
+from worker import prepare as preparing
+from worker.prepare import prepare, shipped_bytes
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    """Settings of an empty folder; a tiny policy stands for the shipped one."""
+    blob = save_checkpoint(tiny_checkpoint())
+    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: blob)
+    return Settings(_env_file=None, state_dir=tmp_path, argon2_cheap=True)
+
+
+def _rows(settings: Settings) -> tuple[list[str], list[Checkpoint], list[Campaign]]:
+    database = Database(settings.database_url)
+    with database.read() as session:
+        names = [row.name for row in session.query(Annotator)]
+        found = (names, list(session.query(Checkpoint)), list(session.query(Campaign)))
+    database.dispose()
+    return found
+
+
+def test_empty_folder_gets_admin_checkpoint_and_a_campaign_that_can_start(
+    settings: Settings,
+) -> None:
+    prepared = prepare(settings)
+    assert prepared.password is not None and len(prepared.password) >= 12
+    names, (checkpoint,), (campaign,) = _rows(settings)
+    assert names == ["admin"]
+    assert checkpoint.digest == tiny_checkpoint().digest
+    facts = checkpoint.config["task_facts"]
+    assert facts["preferred_group"] in facts["groups"]
+    assert len(facts["modes"]) == 24
+    assert campaign.published_checkpoint_id == checkpoint.id
+    assert campaign.criterion == facts["criterion"]
+    assert settings.artifact_dir is not None
+    assert (settings.artifact_dir / "sha256").is_dir()
+
+
+def test_second_time_changes_nothing_and_shows_no_password(settings: Settings) -> None:
+    prepare(settings)
+    before = _rows(settings)
+    assert prepare(settings).password is None
+    after = _rows(settings)
+    assert [len(part) for part in after] == [len(part) for part in before]
+
+
+def test_given_password_replaces_a_forgotten_one(settings: Settings) -> None:
+    prepare(settings)
+    assert prepare(settings, admin_password="a new beginning").password == "a new beginning"
+
+
+def test_newer_shipped_checkpoint_is_added_beside_the_old_one(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(settings)
+    newer = save_checkpoint(tiny_checkpoint(seed=1))
+    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: newer)
+    prepare(settings)
+    _, checkpoints, (campaign,) = _rows(settings)
+    assert len(checkpoints) == 2
+    assert campaign.published_checkpoint_id == checkpoints[0].id
+
+
+def test_damaged_shipped_checkpoint_is_refused(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged = save_checkpoint(tiny_checkpoint())[:-40]
+    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: damaged)
+    with pytest.raises(CheckpointFileError, match="not a readable checkpoint"):
+        prepare(settings)
+
+
+@pytest.mark.parametrize("task", list(TaskName))
+def test_what_is_registered_is_what_is_shipped(task: TaskName) -> None:
+    assert shipped_bytes(task) == shipped_checkpoint(task)
+    assert load_checkpoint(shipped_bytes(task)).task == task
