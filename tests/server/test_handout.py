@@ -1,0 +1,217 @@
+"""Leases: who gets which pair, and never more annotators on a pair than wanted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import timedelta
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select
+
+from server.handout import Handout, NothingReason, next_pair
+from server.labeling import ScreenChoice, Submission, submit_label
+from server.states import PairState
+from server.store.session import Database
+from server.store.tables import Label, Lease, Pair
+from tests import factories
+from tests.factories import NOW
+from tests.server.threads import at_once
+from tests.server.world import World
+
+LEASE = timedelta(minutes=10)
+
+
+def _next(world: World, name: str, campaign_id: int, **body: Any) -> dict[str, Any]:
+    answer = world.client(name).post(f"/campaigns/{campaign_id}/next", json=body)
+    assert answer.status_code == 200, (answer.status_code, dict(answer.headers), answer.text)
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def _nothing(world: World, name: str, campaign_id: int, **body: Any) -> str:
+    answer = world.client(name).post(f"/campaigns/{campaign_id}/next", json=body)
+    assert answer.status_code == 204, answer.text
+    assert answer.content == b""
+    return answer.headers["x-reason"]
+
+
+def _label(world: World, name: str, handed: dict[str, Any], choice: str = "left") -> dict[str, Any]:
+    answer = world.client(name).post(
+        "/labels",
+        json={
+            "pair_id": handed["pair"]["id"],
+            "lease_id": handed["lease_id"],
+            "choice": choice,
+            "ui_version": "test",
+        },
+        headers={"Idempotency-Key": f"{name}-{handed['lease_id']}"},
+    )
+    assert answer.status_code == 201, answer.text
+    stored: dict[str, Any] = answer.json()
+    return stored
+
+
+def test_a_handed_out_pair_shows_nothing_but_the_pair(world: World) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=2)
+    found = _next(world, "ann", campaign_id)
+    assert found == {
+        "lease_id": 1,
+        "expires_at": "2026-11-22T12:10:00Z",
+        "pair": {
+            "id": pair_ids[0],
+            "replay_url": f"/replays/{'b' * 64}.viser",
+            "thumbnail_url": f"/thumbnails/{'c' * 64}.webp",
+            "left_label": "A",
+            "right_label": "B",
+            "duration_s": pytest.approx(81 * 0.035),
+        },
+        "criterion": factories.TASK_FACTS["criterion"],
+        "progress": {"done": 0, "remaining": 2},
+    }
+
+
+def test_a_reloaded_page_gets_its_pair_back_with_more_time(world: World) -> None:
+    campaign_id, _ = world.add_campaign(pairs=3)
+    first = _next(world, "ann", campaign_id)
+    world.clock.advance(minutes=9)
+    again = _next(world, "ann", campaign_id)
+    assert again["lease_id"] == first["lease_id"]
+    assert again["expires_at"] == "2026-11-22T12:19:00Z"
+
+
+def test_prefetching_gives_the_next_pair_and_keeps_both_leases(world: World) -> None:
+    campaign_id, _ = world.add_campaign(pairs=3)
+    shown = _next(world, "ann", campaign_id, hold=1)
+    prefetch = {"hold": 2, "prefetch_after_pair_id": shown["pair"]["id"]}
+    ahead = _next(world, "ann", campaign_id, **prefetch)
+    assert ahead["pair"]["id"] != shown["pair"]["id"]
+    assert _next(world, "ann", campaign_id, **prefetch)["lease_id"] == ahead["lease_id"]
+    assert ahead["progress"] == {"done": 0, "remaining": 3}
+    _label(world, "ann", shown)
+    follow = _next(world, "ann", campaign_id, hold=1)  # what was prefetched comes now
+    assert follow["lease_id"] == ahead["lease_id"]
+    assert follow["progress"] == {"done": 1, "remaining": 2}
+
+
+def test_prefetching_at_the_end_finds_nothing_but_a_reload_still_shows_the_last_pair(
+    world: World,
+) -> None:
+    campaign_id, _ = world.add_campaign(pairs=1)
+    last = _next(world, "ann", campaign_id)
+    prefetch = {"hold": 2, "prefetch_after_pair_id": last["pair"]["id"]}
+    assert _nothing(world, "ann", campaign_id, **prefetch) == "all_done"
+    assert _next(world, "ann", campaign_id, hold=2)["lease_id"] == last["lease_id"]
+
+
+def test_reasons_when_there_is_nothing_to_label(world: World) -> None:
+    campaign_id, _ = world.add_campaign()
+    assert _nothing(world, "ann", campaign_id) == "no_pairs"
+    with world.database.write() as session:
+        campaign = session.get_one(factories.Campaign, campaign_id)
+        factories.add_pairs(session, campaign, 1, state=PairState.WAITING)
+    assert _nothing(world, "ann", campaign_id) == "replays_waiting"
+    with world.database.write() as session:
+        for pair in session.scalars(select(Pair)):
+            pair.state = PairState.READY
+            pair.replay_sha256 = "b" * 64
+    _label(world, "ann", _next(world, "ann", campaign_id))
+    assert _nothing(world, "ann", campaign_id) == "all_done"
+    assert world.client("ann").post("/campaigns/99/next", json={}).status_code == 404
+
+
+def test_an_annotator_never_gets_the_same_pair_twice(world: World) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=4, labels_per_pair=2)
+    for name in ("ann", "bob"):
+        seen = []
+        for _ in pair_ids:
+            handed = _next(world, name, campaign_id)
+            seen.append(handed["pair"]["id"])
+            _label(world, name, handed)
+        assert sorted(seen) == pair_ids
+        assert _nothing(world, name, campaign_id) == "all_done"
+
+
+def test_a_pair_that_others_hold_or_have_labelled_is_not_handed_out(world: World) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=2)
+    anns = _next(world, "ann", campaign_id)
+    bobs = _next(world, "bob", campaign_id)
+    assert {anns["pair"]["id"], bobs["pair"]["id"]} == set(pair_ids)
+    assert _nothing(world, "sam", campaign_id) == "all_done"
+    _label(world, "ann", anns)
+    world.clock.advance(minutes=11)  # bob has left; ann's label holds
+    assert _next(world, "sam", campaign_id)["pair"]["id"] == bobs["pair"]["id"]
+
+
+def test_pairs_with_fewer_labels_come_first(world: World) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=2, labels_per_pair=2)
+    first = _next(world, "ann", campaign_id)
+    assert first["pair"]["id"] == pair_ids[0]
+    assert _next(world, "bob", campaign_id)["pair"]["id"] == pair_ids[1]
+
+
+def test_an_archived_campaign_hands_out_nothing(world: World) -> None:
+    campaign_id, _ = world.add_campaign(pairs=1)
+    world.client("ada").patch(f"/campaigns/{campaign_id}", json={"archived": True})
+    assert _nothing(world, "ann", campaign_id) == "all_done"
+
+
+def _take(database: Database, campaign_id: int, annotator_id: int, hold: int = 1) -> int | None:
+    """One request for work; the pair's id."""
+    with database.write() as session:
+        found = next_pair(session, NOW, campaign_id, annotator_id, lease_for=LEASE, hold=hold)
+        return found.pair.id if isinstance(found, Handout) else None
+
+
+@pytest.mark.parametrize("labels_per_pair", [1, 2, 3])
+def test_annotators_who_ask_at_once_never_crowd_a_pair(
+    database: Database, labels_per_pair: int
+) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session, labels_per_pair=labels_per_pair)
+        factories.add_pairs(session, campaign, 3)
+        people = [factories.add_me(session, f"p{i}") for i in range(10)]
+    given = at_once([lambda me=me: _take(database, campaign.id, me.id) for me in people])
+    counts = Counter(pair_id for pair_id in given if pair_id is not None)
+    assert max(counts.values()) <= labels_per_pair
+    assert sum(counts.values()) == min(10, 3 * labels_per_pair)  # and no room stays unused
+
+
+def test_two_tabs_of_one_annotator_hold_one_pair(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session, labels_per_pair=5)
+        factories.add_pairs(session, campaign, 4)
+        me = factories.add_me(session, "ann")
+    given = at_once([lambda: _take(database, campaign.id, me.id)] * 5)
+    assert len(set(given)) == 1
+    with database.read() as session:
+        assert session.scalar(select(func.count()).select_from(Lease)) == 1
+
+
+def test_a_crowd_labels_everything_exactly_as_often_as_wanted(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session, labels_per_pair=2)
+        pairs = factories.add_pairs(session, campaign, 12)
+        people = [factories.add_me(session, f"p{i}") for i in range(5)]
+
+    def work(index: int) -> int:
+        me, done = people[index], 0
+        while True:
+            with database.write() as session:
+                found = next_pair(session, NOW, campaign.id, me.id, lease_for=LEASE)
+            if isinstance(found, NothingReason):
+                return done
+            answer = Submission(found.pair.id, ScreenChoice.LEFT, lease_id=found.lease.id)
+            with database.write() as session:
+                submit_label(session, NOW, me, answer, idempotency_key=f"{found.lease.id}")
+            done += 1
+
+    done = at_once([lambda index=index: work(index) for index in range(5)])
+    assert sum(done) == 24
+    with database.read() as session:
+        per_pair = Counter(session.scalars(select(Label.pair_id)))
+        twice = select(Label.pair_id, Label.annotator_id).group_by(
+            Label.pair_id, Label.annotator_id
+        )
+        assert len(session.execute(twice).all()) == 24
+    assert per_pair == {pair.id: 2 for pair in pairs}
