@@ -7,12 +7,12 @@ of the job step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, or_, select, update
+from sqlalchemy import ColumnElement, and_, func, not_, or_, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -22,6 +22,8 @@ from server.store.session import JOBS_TO_SEND
 from server.store.tables import Job
 
 DEFAULT_MAX_ATTEMPTS = 5
+# A message can be lost while others wait (it went down with its worker); then it comes late.
+BUSY_PATIENCE = timedelta(minutes=15)
 
 
 @dataclass(frozen=True)
@@ -202,18 +204,30 @@ def _change(session: Session, claim: Claim, values: dict[str, Any]) -> None:
 
 
 def stuck_jobs(
-    session: Session, now: datetime, *, patience: timedelta, limit: int = 200
+    session: Session,
+    now: datetime,
+    *,
+    patience: timedelta,
+    busy_kinds: Collection[JobKind] = (),
+    limit: int = 200,
 ) -> list[tuple[int, JobKind]]:
     """Jobs to send again: queued or with an expired lease, and last sent `patience` ago.
 
-    They are marked as sent and go out after the commit. Harmless when two ticks overlap.
+    Queued jobs of `busy_kinds`, whose queue still holds messages, are not stuck but waiting: they
+    are sent again only after BUSY_PATIENCE. What is returned is marked as sent and goes out after
+    the commit. Harmless when two ticks overlap.
     """
+    waiting = and_(
+        Job.state == JobState.QUEUED,
+        Job.kind.in_(busy_kinds),
+        Job.sent_at > now - BUSY_PATIENCE,
+    )
     due = (
         select(Job.id)
         .where(
             _free(now),
             Job.attempt < Job.max_attempts,
-            or_(Job.sent_at.is_(None), Job.sent_at <= now - patience),
+            or_(Job.sent_at.is_(None), and_(Job.sent_at <= now - patience, not_(waiting))),
         )
         .order_by(Job.id)
         .limit(limit)

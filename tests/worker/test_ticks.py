@@ -49,6 +49,26 @@ def test_running_job_is_sent_again_only_when_its_lease_has_run_out(world: World)
     assert world.sent == [(job_id, JobKind.COLLECT)]
 
 
+def test_jobs_that_wait_in_a_busy_queue_are_not_sent_again_and_again(world: World) -> None:
+    waiting, dead = world.enqueue_collect(), world.enqueue_collect(seed=1000)
+    running._claim(world.bench, dead)
+    world.sent.clear()
+    world.clock.advance(61)
+    resend(world.bench, busy={"rollout"})
+    assert world.sent == [(dead, JobKind.COLLECT)]  # its worker is gone, whatever waits
+    world.sent.clear()
+    resend(world.bench, busy={"replay", "finetune"})
+    assert world.sent == [(waiting, JobKind.COLLECT)]
+
+
+def test_message_that_was_lost_while_others_wait_comes_late_but_comes(world: World) -> None:
+    job_id = world.enqueue_collect()
+    world.sent.clear()
+    world.clock.advance(15 * 60 + 1)
+    resend(world.bench, busy={"rollout"})
+    assert world.sent == [(job_id, JobKind.COLLECT)]
+
+
 def test_tick_shows_that_the_beat_lives(world: World) -> None:
     resend(world.bench)
     with world.bench.database.read() as session:
