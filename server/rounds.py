@@ -245,10 +245,12 @@ def _tell(session: Session, now: datetime, changed: Round) -> None:
 
 def cancel(session: Session, now: datetime, round_id: int, *, by: int | None) -> Round:
     """Cancel the round and its unfinished jobs; raises ConflictError when it has ended."""
-    cancelled = move(session, now, round_id, RoundState.CANCELLED)
     unfinished = select(Job.id).where(
         Job.round_id == round_id, Job.state.in_((JobState.QUEUED, JobState.RUNNING))
     )
+    # Jobs before the round, as a job step locks them: the other order could deadlock with it.
+    session.scalars(unfinished.with_for_update()).all()
+    cancelled = move(session, now, round_id, RoundState.CANCELLED)
     for job_id in list(session.scalars(unfinished)):
         jobs.cancel(session, now, job_id)
     audit(session, now, actor_id=by, action="round.cancel", subject=f"round/{round_id}")
