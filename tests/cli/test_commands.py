@@ -16,10 +16,10 @@ from worker.cli.main import main
 from worker.cli.options import number_list
 
 
-def test_help_loads_no_simulator_and_no_network_library():
+def test_help_loads_no_simulator_and_no_database():
     code = (
         "import sys; from worker.cli.main import build_parser; build_parser().format_help();"
-        "print(sorted({'torch', 'mujoco', 'viser', 'celery', 'rich'} & set(sys.modules)))"
+        "print(sorted({'torch', 'mujoco', 'viser', 'celery', 'sqlalchemy', 'rich'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stderr
