@@ -1,0 +1,69 @@
+"""What the demo calls a success, and what its JSON holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rodif_core.errors import RodifError, ValueOutOfRangeError
+from worker.cli.demo import DemoConfig, DemoResult
+from worker.cli.main import main
+
+
+def evaluation(alignment: float, success: float) -> dict[str, Any]:
+    return {
+        "success": success,
+        "alignment": alignment,
+        "alignment_of_successes": alignment / success,
+        "off_support": 0.02,
+        "n": 200,
+        "intervals": {"success": [0.0, 1.0], "alignment": [0.0, 1.0]},
+        "paths": [[[0.5, 0.0]]],
+    }
+
+
+def result(after: dict[str, Any], state: str = "published") -> DemoResult:
+    before = evaluation(0.15, 0.75)
+    return DemoResult(
+        evaluations={"before": before, "after": after, "rodif": before, "dp_dpo": before},
+        labels={"total": 80, "flipped": 24, "equal": 90},
+        seconds={"total": 123.456},
+        state=state,
+        conservativeness=0.38,
+    )
+
+
+def test_rise_of_thirty_points_with_success_kept_is_a_success():
+    assert result(evaluation(0.46, 0.75)).failures() == []
+
+
+@pytest.mark.parametrize(
+    ("after", "state", "message"),
+    [
+        (evaluation(0.44, 0.9), "published", "a rise of at least 0.3"),
+        (evaluation(0.7, 0.74), "published", "success fell from 0.750 to 0.740"),
+        (evaluation(0.9, 0.9), "rejected", "not published: the round is rejected"),
+    ],
+)
+def test_anything_less_is_a_failure_that_says_why(after: dict[str, Any], state: str, message: str):
+    (sentence,) = result(after, state).failures()
+    assert message in sentence
+
+
+def test_json_has_the_four_policies_the_labels_and_the_seconds():
+    table = result(evaluation(0.9, 0.9)).to_json()
+    assert set(table) == {"before", "after", "rodif", "dp_dpo", "labels", "seconds", "round"}
+    assert {"success", "alignment", "off_support", "n"} <= set(table["after"])
+    assert "paths" not in table["after"]
+    assert table["labels"]["flipped"] == 24
+    assert table["seconds"] == {"total": 123.5}
+
+
+def test_sizes_out_of_range_are_named(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(ValueOutOfRangeError, match=r"flip_rate is 0.5.*\[0, 0.5\)"):
+        DemoConfig(flip_rate=0.5)
+    with pytest.raises(RodifError, match="pairs is 0"):
+        DemoConfig(pairs=0)
+    assert main(["demo", "--headless", "--labels", "0"]) == 1
+    assert "labels is 0, but must be at least 1" in capsys.readouterr().err
