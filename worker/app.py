@@ -19,7 +19,7 @@ from worker.liveness import LivenessStep
 from worker.schedule import beat_schedule
 
 # A child is replaced after so many jobs, or above this memory (KiB): a guard against leaks.
-JOBS_PER_CHILD = 50
+JOBS_PER_CHILD = 200
 MEMORY_PER_CHILD_KIB = 3_000_000
 # After SIGQUIT a running job gets this long; then its message goes back to the queue.
 SOFT_SHUTDOWN_SECONDS = 2.0
