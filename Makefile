@@ -4,6 +4,8 @@ SHELL := /bin/bash
 BIN := .venv/bin
 # One numerical thread per process: two pool children with two threads each are slower than with one.
 export OMP_NUM_THREADS ?= 1
+# Two processes, a file at a time in the order of collection: the long acceptance tests come first.
+PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: help setup setup-dev demo up test check lint type format fast-test bench screenshots chromium clean
 
@@ -23,12 +25,12 @@ up: setup ## Start the embedded system and leave it running. ARGS="--port 8080"
 	@$(BIN)/rodif up $(ARGS)
 
 test: setup-dev chromium lint type ## Everything: lint, types and all tests
-	@$(BIN)/pytest -n 2 --dist loadfile $(ARGS)
+	@$(BIN)/pytest $(PARALLEL) $(ARGS)
 
 check: setup-dev lint type fast-test ## Lint, types and the fast tests
 
 fast-test: setup-dev
-	@$(BIN)/pytest -n 2 --dist loadfile -m "not slow and not browser"
+	@$(BIN)/pytest $(PARALLEL) -m "not slow and not browser"
 
 lint: setup-dev ## Style and formatting
 	@$(BIN)/ruff check .

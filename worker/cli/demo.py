@@ -13,7 +13,7 @@ import secrets
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -38,6 +38,7 @@ ALIGNMENT_GAIN = 0.30  # a demo that steers less has failed
 MEASURES = ("success", "alignment", "alignment_of_successes", "off_support", "n", "intervals")
 COMPARED = (FinetuneMethod.RODIF, FinetuneMethod.DP_DPO)
 PATIENCE_SECONDS = 1800.0  # for one stage
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,11 @@ class DemoResult:
         return found
 
     @contextmanager
-    def stage(self, name: str, console: Console, told: str) -> Iterator[None]:
-        """Time a stage and say what happens meanwhile."""
+    def stage(self, name: str, console: Console, told: str) -> Iterator[Say]:
+        """Time a stage; what is said meanwhile stands behind its name."""
         started = time.monotonic()
-        with console.status(f"{told} …"):
-            yield
+        with console.status(f"{told} …") as status:
+            yield lambda text: status.update(f"{told} … {text}")
         self.seconds[name] = time.monotonic() - started
         console.print(f"{told}: {self.seconds[name]:.1f} s", highlight=False)
 
@@ -114,17 +115,22 @@ def play(
 ) -> DemoResult:
     """All stages on a running system; raises WaitError or ApiError when one fails."""
     result = DemoResult()
-    with result.stage("collect", console, f"{config.episodes} rollouts of the shipped policy"):
+    told = f"{config.episodes} rollouts of the shipped policy"
+    with result.stage("collect", console, told) as say:
         collect = {"episodes": config.episodes, "pairs": config.pairs, "seed": config.seed}
         job = api.post(f"/campaigns/{campaign['id']}/collect", collect)
-        api.wait_for_job(job["id"], seconds=PATIENCE_SECONDS)
-    with result.stage("replays", console, f"{config.pairs} replays of pairs"):
-        wait_for_replays(api, campaign["id"])
+        api.wait_for_job(
+            job["id"],
+            seconds=PATIENCE_SECONDS,
+            progress=lambda now: say(f"{now['progress']:.0%}"),
+        )
+    with result.stage("replays", console, f"{config.pairs} replays of pairs") as say:
+        wait_for_replays(api, campaign["id"], say)
     with result.stage("labels", console, f"{config.annotators} simulated annotators by REST"):
         report = _label(api, campaign, config)
     result.labels = {"total": report.total, "flipped": report.flipped, "equal": report.equal}
-    with result.stage("rounds", console, "three rounds on the same labels"):
-        ended = run_rounds(api, campaign["id"], config)
+    with result.stage("rounds", console, "three rounds on the same labels") as say:
+        ended = run_rounds(api, campaign["id"], config, say)
     guided = ended[FinetuneMethod.RODIF_GUIDED]
     result.state = guided["state"]
     result.conservativeness = (guided["noise"] or {}).get("conservativeness")
@@ -149,7 +155,7 @@ def _label(api: Client, campaign: Mapping[str, Any], config: DemoConfig) -> Simu
     return simulate(api, campaign, asked)
 
 
-def wait_for_replays(api: Client, campaign_id: int) -> None:
+def wait_for_replays(api: Client, campaign_id: int, say: Say) -> None:
     """Until no pair waits for its replay; raises WaitError when one failed or it takes too long."""
     from worker.cli.client import POLL_SECONDS, WaitError
 
@@ -157,13 +163,14 @@ def wait_for_replays(api: Client, campaign_id: int) -> None:
     while (pairs := api.get(f"/campaigns/{campaign_id}/stats")["pairs"])["waiting"]:
         if time.monotonic() > deadline:
             raise WaitError(f"{pairs['waiting']} replays are still missing")
+        say(f"{pairs['waiting']} left")
         time.sleep(POLL_SECONDS)
     if pairs["failed"]:
         raise WaitError(f"{pairs['failed']} replays could not be made; see `rodif doctor`")
 
 
 def run_rounds(
-    api: Client, campaign_id: int, config: DemoConfig
+    api: Client, campaign_id: int, config: DemoConfig, say: Say
 ) -> dict[FinetuneMethod, dict[str, Any]]:
     """The publishing round, and the comparison rounds on its snapshot; all from one parent."""
     from worker.cli import round as rounds
@@ -189,7 +196,11 @@ def run_rounds(
             updates=config.comparison_updates,
         )
     return {
-        method: api.wait_for_round(one["id"], seconds=PATIENCE_SECONDS)
+        method: api.wait_for_round(
+            one["id"],
+            seconds=PATIENCE_SECONDS,
+            progress=lambda now: say(f"{now['config']['method']} {now['state']}"),
+        )
         for method, one in started.items()
     }
 
