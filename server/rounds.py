@@ -244,7 +244,7 @@ def _tell(session: Session, now: datetime, changed: Round) -> None:
 
 
 def cancel(session: Session, now: datetime, round_id: int, *, by: int | None) -> Round:
-    """Cancel the round and its unfinished jobs; raises ConflictError when it has ended."""
+    """Cancel the round and its unfinished jobs; ConflictError when it has ended otherwise."""
     unfinished = select(Job.id).where(
         Job.round_id == round_id, Job.state.in_((JobState.QUEUED, JobState.RUNNING))
     )

@@ -236,9 +236,9 @@ def test_a_cancelled_job_is_lost_for_its_worker_and_cannot_be_claimed(
 def test_only_failed_jobs_can_be_retried_and_old_claims_stay_dead(
     database: Database, job_id: int
 ) -> None:
-    with pytest.raises(ConflictError, match="only jobs in state 'failed'"):
-        with database.write() as session:
-            jobs.retry(session, NOW, job_id)
+    refused = pytest.raises(ConflictError, match="only jobs in state 'failed'")
+    with refused, database.write() as session:
+        jobs.retry(session, NOW, job_id)
     claim = _must(_claim(database, job_id))
     with database.write() as session:
         jobs.fail(session, NOW, claim, "broken", retry=False)

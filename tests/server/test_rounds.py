@@ -1,0 +1,437 @@
+"""Rounds: frozen snapshots, legal steps, one publishing round at a time, what is due."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from datetime import timedelta
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from server import rounds
+from server.errors import ConflictError, NotFoundError
+from server.rounds import RoundRequest
+from server.states import (
+    Choice,
+    JobKind,
+    JobState,
+    PairState,
+    PublishRule,
+    RoundState,
+    RoundTrigger,
+)
+from server.store import jobs
+from server.store.labels import snapshot_labels
+from server.store.session import Database
+from server.store.tables import Event, Job, LabelSnapshot, Pair, Round
+from tests import factories
+from tests.factories import NOW
+from tests.server.threads import at_once
+from tests.server.world import World
+
+
+def _labelled(world: World, count: int = 2, **settings: Any) -> int:
+    """A campaign with `count` labels by ann."""
+    campaign_id, pair_ids = world.add_campaign(pairs=count + 2, **settings)
+    with world.database.write() as session:
+        for pair_id in pair_ids[:count]:
+            pair = session.get_one(Pair, pair_id)
+            factories.add_label(session, pair, world.ids["ann"])
+    return campaign_id
+
+
+def _launch(world: World, campaign_id: int, **body: Any) -> Any:
+    return world.client("ada").post(f"/campaigns/{campaign_id}/rounds", json=body)
+
+
+def test_a_launched_round_is_frozen_queued_and_can_be_followed(world: World) -> None:
+    campaign_id = _labelled(world)
+    answer = _launch(world, campaign_id, config={"updates": 5}, seed=3)
+    assert answer.status_code == 202
+    found = answer.json()
+    assert answer.headers["location"] == f"/api/v1/rounds/{found['id']}"
+    assert (found["state"], found["trigger"], found["publish_rule"]) == ("queued", "manual", "auto")
+    assert found["config"]["method"] == "rodif_guided"
+    assert (found["config"]["updates"], found["config"]["seed"]) == (5, 3)
+    assert found["evaluation"] == {"episodes": 200, "seed": rounds.EVALUATION_SEED}
+    assert (found["labels"], found["candidate_checkpoint_id"]) == (2, None)
+    assert found["started_by"] == world.ids["ada"] and found["parent_checkpoint_id"] == 1
+    with world.database.read() as session:
+        job = session.scalars(select(Job).where(Job.round_id == found["id"])).one()
+    assert job.dedupe_key == f"finetune:{found['id']}"
+    assert world.sent == [(job.id, JobKind.FINETUNE)]
+    assert world.client("ada").get(f"/rounds/{found['id']}").json() == found
+    assert world.client("ada").get(f"/campaigns/{campaign_id}/rounds").json() == [found]
+
+
+def test_a_snapshot_holds_the_last_word_of_each_annotator_on_each_pair(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session)
+        pairs = factories.add_pairs(session, campaign, 3)
+        ann, bob = factories.add_me(session, "ann").id, factories.add_me(session, "bob").id
+        old = factories.add_label(session, pairs[0], ann)
+        edit = factories.add_label(session, pairs[0], ann, Choice.EQUAL, supersedes_id=old.id)
+        other = factories.add_label(session, pairs[0], bob)
+        gone = factories.add_label(session, pairs[1], ann)
+        undo = factories.add_label(session, pairs[1], ann, supersedes_id=gone.id, retracted=True)
+        again = factories.add_label(session, pairs[1], ann, supersedes_id=undo.id, key="again")
+        lone = factories.add_label(session, pairs[2], bob)
+        factories.add_label(session, pairs[2], bob, supersedes_id=lone.id, retracted=True)
+        snapshot = rounds.freeze_snapshot(session, NOW, campaign.id)
+        expected = [edit.id, other.id, again.id]
+        assert snapshot.label_ids == expected and snapshot.size == 3
+        held = snapshot_labels(session, snapshot.digest)
+        assert [label.id for label in held] == expected
+    content = f'{{"campaign_id":{campaign.id},"label_ids":{json.dumps(expected)}}}'.replace(" ", "")
+    assert snapshot.digest == hashlib.sha256(content.encode()).hexdigest()
+
+
+def test_a_snapshot_is_the_same_until_a_label_comes_and_never_changes(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session)
+        pairs = factories.add_pairs(session, campaign, 2)
+        ann = factories.add_me(session, "ann").id
+        label = factories.add_label(session, pairs[0], ann)
+        first = rounds.freeze_snapshot(session, NOW, campaign.id).digest
+    with database.write() as session:
+        later = NOW + timedelta(days=1)
+        assert rounds.freeze_snapshot(session, later, campaign.id).digest == first
+        factories.add_label(session, pairs[0], ann, supersedes_id=label.id, retracted=True)
+        factories.add_label(session, pairs[1], ann)
+        second = rounds.freeze_snapshot(session, later, campaign.id)
+        assert second.digest != first
+        assert [row.id for row in snapshot_labels(session, first)] == [label.id]
+        with pytest.raises(NotFoundError, match="no label snapshot 'zzz'"):
+            snapshot_labels(session, "zzz")
+
+
+def test_a_comparison_round_can_reuse_the_snapshot_of_another(world: World) -> None:
+    campaign_id = _labelled(world)
+    digest = _launch(world, campaign_id).json()["snapshot_digest"]
+    with world.database.write() as session:
+        pair = session.scalars(select(Pair).order_by(Pair.id.desc())).first()
+        assert pair is not None
+        factories.add_label(session, pair, world.ids["bob"])
+    body = {"publish_rule": "never", "snapshot_digest": digest, "config": {"method": "dp_dpo"}}
+    for _ in range(2):  # any number of them may run beside each other
+        again = _launch(world, campaign_id, **body)
+        assert again.status_code == 202
+        assert (again.json()["snapshot_digest"], again.json()["labels"]) == (digest, 2)
+    other_id = _labelled(world)
+    foreign = _launch(world, other_id, snapshot_digest=digest)
+    assert foreign.status_code == 404 and digest in foreign.json()["detail"]
+
+
+def test_a_second_publishing_round_is_refused_while_one_runs(world: World) -> None:
+    campaign_id = _labelled(world)
+    first = _launch(world, campaign_id).json()["id"]
+    answer = _launch(world, campaign_id, publish_rule="manual")
+    assert answer.status_code == 409
+    assert f"round {first} of campaign {campaign_id} is 'queued'" in answer.json()["detail"]
+    with world.database.write() as session:
+        rounds.move(session, NOW, first, RoundState.FAILED, error="x")
+    assert _launch(world, campaign_id).status_code == 202
+
+
+def test_of_many_launches_at_once_one_wins(world: World) -> None:
+    campaign_id = _labelled(world)
+    answers = at_once([lambda: _launch(world, campaign_id)] * 4)
+    assert sorted(answer.status_code for answer in answers) == [202, 409, 409, 409]
+    assert len(world.sent) == 1
+
+
+@pytest.mark.parametrize("choice", [None, Choice.EQUAL, Choice.CANNOT_TELL])
+def test_a_round_needs_a_label_that_says_which_is_better(
+    world: World, choice: Choice | None
+) -> None:
+    campaign_id, (pair_id,) = world.add_campaign(pairs=1)
+    if choice is not None:
+        with world.database.write() as session:
+            pair = session.get_one(Pair, pair_id)
+            factories.add_label(session, pair, world.ids["ann"], choice)
+    answer = _launch(world, campaign_id)
+    assert answer.status_code == 409
+    assert "none says which episode is better" in answer.json()["detail"]
+    with world.database.read() as session:
+        assert session.scalars(select(Round)).all() == []
+        assert session.scalars(select(LabelSnapshot)).all() == []
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"conservativeness": 1.0}, "conservativeness is 1.0, but must be in [0, 1)"),
+        ({"conservativeness": -0.1}, "conservativeness is -0.1, but must be in [0, 1)"),
+        ({"conservativeness": "0.5"}, "conservativeness is '0.5', but must be a finite number"),
+        ({"conservativeness": True}, "conservativeness is True, but must be a finite number"),
+        ({"method": "magic"}, "unknown method 'magic'; legal values are 'rodif_guided', 'rodif'"),
+        ({"method": 7}, "method is 7, but must be text"),
+        ({"reduction": "max"}, "unknown reduction 'max'; legal values are 'sum', 'mean', 'group'"),
+        ({"gamma": 0.5}, "unknown FinetuneConfig field 'gamma'; legal values are 'method'"),
+        ({"updates": 2.5}, "updates is 2.5, but must be a whole number"),
+        ({"updates": 0}, "updates is 0, but must be at least 1"),
+        ({"executed_only": 1}, "executed_only is 1, but must be true or false"),
+        ({"guide": {"scales": [1, "2"]}}, "scales is [1, '2'], but must be a list of finite"),
+        ({"guide": {"scales": []}}, "scales is (), but must be one or more numbers"),
+        ({"guide": {"colour": 1}}, "unknown GuideConfig field 'colour'"),
+        ({"guide": 3}, "guide is 3, but must be an object"),
+        ({"seed": 10**30}, "seed is 1000000000000000000000000000000, but must be a whole number"),
+    ],
+)
+def test_a_wrong_configuration_is_refused_with_the_legal_values(
+    sqlite_world: World, config: dict[str, Any], words: str
+) -> None:
+    answer = _launch(sqlite_world, _labelled(sqlite_world), config=config)
+    assert answer.status_code == 422
+    assert words in answer.json()["detail"]
+    assert answer.json()["errors"][0]["field"] in words
+    assert sqlite_world.sent == []
+
+
+def test_not_a_number_is_refused(sqlite_world: World) -> None:
+    campaign_id = _labelled(sqlite_world)
+    answer = sqlite_world.client("ada").post(
+        f"/campaigns/{campaign_id}/rounds",
+        content='{"config": {"kl_coef": NaN}}',
+        headers={"Content-Type": "application/json"},
+    )
+    assert answer.status_code == 422
+    assert "kl_coef is nan, but must be a finite number" in answer.json()["detail"]
+
+
+@pytest.fixture
+def round_id(database: Database) -> int:
+    with database.write() as session:
+        campaign = factories.add_campaign(session)
+        pair = factories.add_pairs(session, campaign, 1)[0]
+        factories.add_label(session, pair, campaign.created_by)
+        return rounds.launch(session, NOW, campaign.id, RoundRequest()).id
+
+
+PATH = [
+    RoundState.FINETUNING,
+    RoundState.EVALUATING,
+    RoundState.GATING,
+    RoundState.PUBLISHED,
+]
+
+
+def test_a_round_goes_through_its_states_and_tells_each(database: Database, round_id: int) -> None:
+    for step, state in enumerate(PATH):
+        with database.write() as session:
+            at = NOW + timedelta(minutes=step)
+            assert rounds.move(session, at, round_id, state).state == state
+            rounds.move(session, at, round_id, state)  # a job that runs twice changes nothing
+    with database.read() as session:
+        ended = session.get_one(Round, round_id)
+        told = session.scalars(select(Event.data).where(Event.round_id == round_id))
+        assert [data["state"] for data in told] == ["queued", *PATH]
+    assert ended.finished_at == NOW + timedelta(minutes=3)
+
+
+@pytest.mark.parametrize(
+    ("path", "wrong"),
+    [
+        ([], RoundState.EVALUATING),
+        ([], RoundState.PUBLISHED),
+        (PATH[:1], RoundState.QUEUED),
+        (PATH[:2], RoundState.PUBLISHED),
+        (PATH, RoundState.FAILED),
+        (PATH, RoundState.CANCELLED),
+        ([RoundState.CANCELLED], RoundState.FINETUNING),
+        ([RoundState.FAILED], RoundState.FINETUNING),
+    ],
+)
+def test_illegal_steps_are_refused(
+    database: Database, round_id: int, path: list[RoundState], wrong: RoundState
+) -> None:
+    with database.write() as session:
+        for state in path:
+            rounds.move(session, NOW, round_id, state)
+        with pytest.raises(ConflictError, match=f"cannot become '{wrong.value}'; legal are"):
+            rounds.move(session, NOW, round_id, wrong)
+
+
+def test_cancelling_stops_the_jobs_and_is_refused_afterwards(world: World) -> None:
+    campaign_id = _labelled(world)
+    round_id = _launch(world, campaign_id).json()["id"]
+    answer = world.client("sam").post(f"/rounds/{round_id}/cancel")
+    assert answer.status_code == 200 and answer.json()["state"] == "cancelled"
+    with world.database.read() as session:
+        job = session.scalars(select(Job).where(Job.round_id == round_id)).one()
+    assert job.state == JobState.CANCELLED
+    assert world.client("sam").post(f"/rounds/{round_id}/cancel").status_code == 200  # no change
+    with world.database.write() as session:
+        other = rounds.launch(session, NOW, campaign_id, RoundRequest()).id
+        for state in PATH:
+            rounds.move(session, NOW, other, state)
+    refused = world.client("sam").post(f"/rounds/{other}/cancel")
+    assert refused.status_code == 409 and "'published'" in refused.json()["detail"]
+    assert world.client("sam").post("/rounds/99/cancel").status_code == 404
+
+
+def test_retrying_a_failed_job_takes_up_its_round(world: World) -> None:
+    round_id = _launch(world, _labelled(world)).json()["id"]
+    lease = timedelta(seconds=60)
+    with world.database.write() as session:
+        job = session.scalars(select(Job).where(Job.round_id == round_id)).one()
+        claim = jobs.claim(session, NOW, job.id, owner="w", lease=lease)
+        assert claim is not None
+        rounds.move(session, NOW, round_id, RoundState.FINETUNING)
+        jobs.fail(session, NOW, claim, "disk full", retry=False)
+        rounds.move(session, NOW, round_id, RoundState.FAILED, error="disk full")
+    client = world.client("sam")
+    assert client.get(f"/rounds/{round_id}").json()["error"] == "disk full"
+    answer = client.post(f"/jobs/{job.id}/retry")
+    assert answer.status_code == 200 and answer.json()["state"] == "queued"
+    found = client.get(f"/rounds/{round_id}").json()
+    assert (found["state"], found["error"], found["finished_at"]) == ("queued", None, None)
+    assert world.sent[-1] == (job.id, JobKind.FINETUNE)
+    assert client.post(f"/jobs/{job.id}/retry").status_code == 409
+    states = [row["state"] for row in client.get("/jobs?state=queued").json()]
+    assert states and set(states) == {"queued"}
+
+
+def test_retrying_a_failed_replay_makes_its_pair_wait_again(world: World) -> None:
+    campaign_id, (pair_id,) = world.add_campaign(pairs=1)
+    with world.database.write() as session:
+        session.get_one(Pair, pair_id).state = PairState.FAILED
+        job = jobs.enqueue(
+            session,
+            NOW,
+            kind=JobKind.REPLAY,
+            campaign_id=campaign_id,
+            pair_id=pair_id,
+            payload={},
+        )
+        job.state = JobState.FAILED
+    assert world.client("sam").post(f"/jobs/{job.id}/retry").status_code == 200
+    assert world.client("sam").get(f"/pairs/{pair_id}").json()["state"] == "waiting"
+
+
+def test_curves_are_the_points_of_the_round_in_order(world: World) -> None:
+    round_id = _launch(world, _labelled(world)).json()["id"]
+    with world.database.write() as session:
+        campaign_id = session.get_one(Round, round_id).campaign_id
+        for step in range(3):
+            session.add(
+                Event(
+                    campaign_id=campaign_id,
+                    round_id=round_id,
+                    kind="curve",
+                    data={"stage": "score", "step": step, "loss": 1.0 / (step + 1)},
+                    at=NOW,
+                )
+            )
+            session.flush()
+    points = world.client("sam").get(f"/rounds/{round_id}/curves").json()
+    assert [point["step"] for point in points] == [0, 1, 2]
+    assert points[1] == {"stage": "score", "step": 1, "loss": 0.5}
+
+
+def _add_labels(session: Any, campaign_id: int, pairs: slice) -> None:
+    owner = session.get_one(factories.Campaign, campaign_id).created_by
+    rows = session.scalars(select(Pair).where(Pair.campaign_id == campaign_id).order_by(Pair.id))
+    for pair in rows.all()[pairs]:
+        factories.add_label(session, pair, owner)
+
+
+def _due(database: Database, campaign_id: int, minutes: float = 0) -> RoundTrigger | None:
+    with database.read() as session:
+        campaign = session.get_one(factories.Campaign, campaign_id)
+        return rounds.is_due(session, NOW + timedelta(minutes=minutes), campaign)
+
+
+def _campaign(database: Database, **settings: Any) -> int:
+    with database.write() as session:
+        campaign = factories.add_campaign(session, **settings)
+        factories.add_pairs(session, campaign, 8)
+        return campaign.id
+
+
+def test_a_round_is_due_after_enough_new_labels(database: Database) -> None:
+    campaign_id = _campaign(database, round_after_labels=3)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+    assert _due(database, campaign_id) is None
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(2, 3))
+    assert _due(database, campaign_id) is RoundTrigger.LABELS
+    with database.write() as session:
+        started = rounds.launch_due(session, NOW, campaign_id)
+        assert started is not None and started.trigger == RoundTrigger.LABELS
+    assert _due(database, campaign_id) is None  # it runs
+    with database.write() as session:
+        rounds.move(session, NOW, started.id, RoundState.FAILED)
+        _add_labels(session, campaign_id, slice(3, 5))
+    assert _due(database, campaign_id) is None  # two new ones only
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(5, 6))
+    assert _due(database, campaign_id) is RoundTrigger.LABELS
+
+
+def test_a_round_is_due_every_few_minutes_when_there_is_something_new(database: Database) -> None:
+    campaign_id = _campaign(database, round_every_minutes=30.0)
+    assert _due(database, campaign_id, minutes=60) is None  # no labels at all
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 1))
+    assert _due(database, campaign_id, minutes=29) is None
+    assert _due(database, campaign_id, minutes=30) is RoundTrigger.PERIODIC
+    with database.write() as session:
+        at = NOW + timedelta(minutes=30)
+        started = rounds.launch_due(session, at, campaign_id)
+        assert started is not None
+        rounds.move(session, at, started.id, RoundState.FAILED)
+    assert _due(database, campaign_id, minutes=90) is None  # nothing new since
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(1, 2))
+    assert _due(database, campaign_id, minutes=59) is None
+    assert _due(database, campaign_id, minutes=60) is RoundTrigger.PERIODIC
+
+
+def test_nothing_is_due_when_switched_off_or_archived(database: Database) -> None:
+    off = _campaign(database)
+    with database.write() as session:
+        _add_labels(session, off, slice(0, 8))
+        assert rounds.active_campaign_ids(session) == [off]
+    assert _due(database, off, minutes=10_000) is None
+    with database.write() as session:
+        campaign = session.get_one(factories.Campaign, off)
+        campaign.settings = campaign.settings | {"round_after_labels": 1}
+        campaign.archived = True
+    assert _due(database, off) is None
+    with database.read() as session:
+        assert rounds.active_campaign_ids(session) == []
+
+
+def test_comparison_rounds_do_not_count_as_learning(database: Database) -> None:
+    campaign_id = _campaign(database, round_after_labels=2)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+        rounds.launch(session, NOW, campaign_id, RoundRequest(publish_rule=PublishRule.NEVER))
+    assert _due(database, campaign_id) is RoundTrigger.LABELS
+
+
+def test_labels_that_say_nothing_start_no_round(database: Database) -> None:
+    campaign_id = _campaign(database, round_after_labels=1)
+    with database.write() as session:
+        pair = session.scalars(select(Pair)).first()
+        assert pair is not None
+        factories.add_label(session, pair, 1, Choice.EQUAL)
+        assert rounds.launch_due(session, NOW, campaign_id) is None
+    with database.read() as session:
+        assert session.scalars(select(Round)).all() == []
+
+
+def test_two_ticks_at_once_start_one_round(database: Database) -> None:
+    campaign_id = _campaign(database, round_after_labels=1)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+
+    def tick() -> bool:
+        with database.write() as session:
+            return rounds.launch_due(session, NOW, campaign_id) is not None
+
+    assert sorted(at_once([tick] * 4)) == [False, False, False, True]
