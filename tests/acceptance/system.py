@@ -60,7 +60,7 @@ def running_site(state: Path, **settings: Any) -> Iterator[Site]:
         "state_dir": state,
         "port": 0,
         "argon2_cheap": True,
-        "job_lease_seconds": 2.0,
+        "job_lease_seconds": 4.0,
         "resend_seconds": 0.5,
     }
     given = Settings(_env_file=None, **(chosen | settings))

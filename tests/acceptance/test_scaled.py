@@ -34,7 +34,7 @@ from worker.supervisor import System, tail
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-EPISODES, PAIRS = 24, 6
+EPISODES, PAIRS = 12, 4
 
 
 @pytest.fixture
