@@ -60,11 +60,30 @@ def problem(
 
 
 def install(app: FastAPI) -> None:
-    """Register the handlers below."""
+    """Register the handlers below, and say in the OpenAPI document what errors look like."""
+    describe = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = describe()
+        for methods in document["paths"].values():
+            for operation in methods.values():
+                _name_media_type(operation["responses"])
+        return document
+
+    app.openapi = openapi  # type: ignore[method-assign]  # the documented way to extend it
     app.add_exception_handler(RodifError, _rodif_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(Exception, _unexpected_error)
+
+
+def _name_media_type(responses: dict[str, Any]) -> None:
+    """FastAPI writes every model down as application/json; errors are application/problem+json."""
+    for response in responses.values():
+        content = response.get("content", {})
+        schema = content.get("application/json", {}).get("schema", {})
+        if schema.get("$ref", "").endswith("/Problem"):
+            content[PROBLEM_TYPE] = content.pop("application/json")
 
 
 def _rodif_error(_request: Request, error: Exception) -> JSONResponse:

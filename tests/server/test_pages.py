@@ -1,0 +1,121 @@
+"""Pages, their guards, and the files they load. What the pages do is tested in a browser."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+import pytest
+
+from server.pages import REPLAY_CLIENT_POLICY
+from tests.server.world import World
+
+PAGES = ["/label", "/label/1", "/admin", "/admin/campaigns/1"]
+
+
+@pytest.mark.parametrize("path", ["/", *PAGES])
+def test_strangers_are_sent_to_sign_in_and_back(sqlite_world: World, path: str) -> None:
+    answer = sqlite_world.browser().get(path, follow_redirects=False)
+    assert answer.status_code == 303
+    assert answer.headers["location"] == f"/sign-in?next={path}"
+
+
+@pytest.mark.parametrize(("name", "home"), [("ada", "/admin"), ("ann", "/label")])
+def test_everybody_has_a_home(sqlite_world: World, name: str, home: str) -> None:
+    browser = sqlite_world.signed_in(name)
+    for path in ("/", "/sign-in"):
+        answer = browser.get(path, follow_redirects=False)
+        assert (answer.status_code, answer.headers["location"]) == (303, home)
+
+
+@pytest.mark.parametrize("path", ["/sign-in", *PAGES])
+def test_pages_render_under_a_policy_that_allows_no_foreign_or_inline_script(
+    sqlite_world: World, path: str
+) -> None:
+    sqlite_world.add_campaign()
+    browser = sqlite_world.browser() if path == "/sign-in" else sqlite_world.signed_in("ada")
+    answer = browser.get(path)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/html")
+    policy = answer.headers["content-security-policy"]
+    assert policy.startswith("default-src 'self'") and "script-src" not in policy
+    assert "unsafe-eval" not in policy
+    inline = re.findall(r"<script(?![^>]*\bsrc=)(?![^>]*application/json)[^>]*>", answer.text)
+    assert inline == []
+    assert re.findall(r"(?:src|href)=\"(?:https?:)?//", answer.text) == []
+
+
+def test_pages_know_account_campaign_and_version(sqlite_world: World) -> None:
+    sqlite_world.add_campaign()
+    text = sqlite_world.signed_in("ann").get("/label/1").text
+    assert "Pass the first obstacle on its left side." in text
+    version = sqlite_world.app.state.ui_version
+    assert re.fullmatch(r"0\.1\.0\+[0-9a-f]{12}", version) and len(version) <= 32
+    assert version in text
+
+
+@pytest.mark.parametrize("path", ["/admin", "/admin/campaigns/1"])
+def test_annotators_are_sent_from_admin_pages_to_their_own(sqlite_world: World, path: str) -> None:
+    answer = sqlite_world.signed_in("ann").get(path, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/label")
+
+
+def test_a_page_of_an_unknown_campaign_says_so(sqlite_world: World) -> None:
+    answer = sqlite_world.signed_in("ann").get("/label/99")
+    assert answer.status_code == 404 and "no campaign 99" in answer.text
+    assert sqlite_world.signed_in("ann").get("/label/abc").status_code == 404
+
+
+def test_every_file_that_a_page_names_is_served(sqlite_world: World) -> None:
+    sqlite_world.add_campaign()
+    browser = sqlite_world.signed_in("ada")
+    for path in PAGES:
+        for url in set(
+            re.findall(r"(?:src|href)=\"(/(?:static|vendor)/[^\"]+)\"", browser.get(path).text)
+        ):
+            assert browser.get(url).status_code == 200, (path, url)
+
+
+def test_a_replay_is_served_for_ever_and_in_part(sqlite_world: World) -> None:
+    artifacts = sqlite_world.app.state.services.artifacts
+    data = bytes(range(256)) * 40
+    sha256 = artifacts.put(data)
+    browser = sqlite_world.signed_in("ann")
+    answer = browser.get(f"/replays/{sha256}.viser")
+    assert answer.content == data
+    assert answer.headers["cache-control"] == "private, max-age=31536000, immutable"
+    assert "sandbox" in answer.headers["content-security-policy"]
+    head = browser.head(f"/replays/{sha256}.viser")
+    assert head.status_code == 200 and head.headers["content-length"] == str(len(data))
+    part = browser.get(f"/replays/{sha256}.viser", headers={"Range": "bytes=0-9"})
+    assert (part.status_code, part.content) == (206, data[:10])
+    thumbnail = browser.get(f"/thumbnails/{sha256}.webp")
+    assert thumbnail.headers["content-type"] == "image/webp"
+
+
+@pytest.mark.parametrize("name", ["..%2f..%2frodif", "A" * 64, "short"])
+def test_a_replay_that_is_no_hash_is_not_found(sqlite_world: World, name: str) -> None:
+    assert sqlite_world.signed_in("ann").get(f"/replays/{name}.viser").status_code == 404
+
+
+def test_the_replay_client_is_the_installed_one_with_our_adapter(sqlite_world: World) -> None:
+    assert sqlite_world.browser().get("/replay-client/").status_code == 401
+    browser = sqlite_world.signed_in("ann")
+    answer = browser.get("/replay-client/")
+    assert answer.status_code == 200
+    assert answer.headers["content-security-policy"] == REPLAY_CLIENT_POLICY
+    assert "'unsafe-eval'" not in REPLAY_CLIENT_POLICY
+    adapter = browser.get("/static/replay-adapter.js").text
+    head, found, _rest = answer.text.partition(f"<script>{adapter}</script></head>")
+    assert found and "<body" not in head
+    assert len(answer.content) > 500_000
+    again = browser.get("/replay-client/", headers={"If-None-Match": answer.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_plotly_comes_out_of_the_installed_package(sqlite_world: World) -> None:
+    answer = sqlite_world.browser().get("/vendor/plotly.min.js")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/javascript")
+    assert b"plotly.js v" in answer.content[:200]
+    assert len(hashlib.sha256(answer.content).hexdigest()) == 64

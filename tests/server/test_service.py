@@ -1,0 +1,189 @@
+"""The service as a whole: what it imports, what it documents, how it takes odd requests."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, settings
+from schemathesis.checks import not_a_server_error
+from schemathesis.schemas import APIOperation
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+from starlette.testclient import TestClient
+
+from server import pages
+from server.bootstrap import ensure_admin, register_checkpoint
+from server.errors import ConflictError
+from server.store.artifacts import ArtifactStore
+from server.store.session import Database
+from tests import factories
+from tests.factories import NOW
+from tests.server.world import World
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("module", ["server.app", "server.bootstrap", "server.rounds"])
+def test_the_server_needs_neither_torch_nor_mujoco_nor_viser(module: str) -> None:
+    heavy = "{'torch', 'mujoco', 'viser', 'plotly', 'labeling_ui', 'worker'}"
+    code = f"import sys, {module}; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("module", ["server.rounds", "server.labeling", "server.store.jobs"])
+def test_use_cases_and_store_know_no_web_framework(module: str) -> None:
+    code = f"import sys, {module}; print('fastapi' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_every_endpoint_is_named_in_the_documentation(sqlite_world: World) -> None:
+    text = (ROOT / "docs" / "api.md").read_text()
+    paths = sqlite_world.app.openapi()["paths"]
+    missing = [
+        f"{method.upper()} {path.removeprefix('/api/v1')}"
+        for path, methods in paths.items()
+        for method in methods
+        if f"`{method.upper()} {path.removeprefix('/api/v1')}`" not in text
+    ]
+    assert missing == []
+
+
+def test_every_page_and_file_route_is_named_in_the_documentation() -> None:
+    text = (ROOT / "docs" / "api.md").read_text()
+    routes = {getattr(route, "path", "").replace(":int", "") for route in pages.router.routes}
+    assert {path for path in routes if f"`{path}`" not in text} == set()
+
+
+def test_errors_outside_the_endpoints_are_problems_too(sqlite_world: World) -> None:
+    client = sqlite_world.client("ada")
+    for method, path, status in (
+        ("GET", "/nothing", 404),
+        ("DELETE", "/campaigns", 405),
+        ("GET", "/campaigns/0", 422),
+        ("GET", f"/campaigns/{2**31}", 422),
+        ("GET", "/campaigns/one", 422),
+    ):
+        answer = client.request(method, path)
+        assert answer.status_code == status
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert answer.json()["status"] == status and answer.json()["title"]
+
+
+@pytest.mark.parametrize("content", [b"{nope", b"", b"\xff\xfe", b"[1]"])
+def test_bodies_that_are_no_json_object_are_refused(sqlite_world: World, content: bytes) -> None:
+    headers = {"Content-Type": "application/json"}
+    answer = sqlite_world.client("ada").post("/annotators", content=content, headers=headers)
+    assert answer.status_code in (400, 422)
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_huge_body_is_refused(sqlite_world: World) -> None:
+    content = b'{"name": "' + b"x" * 3_000_000 + b'"}'
+    headers = {"Content-Type": "application/json"}
+    answer = sqlite_world.client("ada").post("/annotators", content=content, headers=headers)
+    assert answer.status_code == 413
+
+
+def test_an_unexpected_error_is_a_problem_without_details(
+    sqlite_world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("secret detail")
+
+    monkeypatch.setattr("server.api.campaigns.campaigns.campaign_stats", broken)
+    campaign_id, _ = sqlite_world.add_campaign()
+    headers = sqlite_world.client("ada").headers
+    client = TestClient(sqlite_world.app, headers=headers, raise_server_exceptions=False)
+    answer = client.get(f"/api/v1/campaigns/{campaign_id}/stats")
+    assert answer.status_code == 500
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "secret" not in answer.text
+
+
+def test_bootstrapping_twice_changes_nothing(database: Database, tmp_path: Path) -> None:
+    store = ArtifactStore(tmp_path / "artifacts")
+
+    def register(blob: bytes, digest: str) -> int:
+        with database.write() as session:
+            return register_checkpoint(
+                session,
+                NOW,
+                store,
+                task="avoid",
+                name="avoid-pretrained",
+                blob=blob,
+                digest=digest,
+                config={"task_facts": factories.TASK_FACTS},
+                metrics={},
+                code_version="0.1.0",
+            ).id
+
+    assert register(b"weights", "1" * 64) == register(b"weights", "1" * 64)
+    with pytest.raises(ConflictError, match="checkpoints are immutable"):
+        register(b"other weights", "2" * 64)
+    with database.write() as session:
+        password = ensure_admin(session, NOW, cheap=True)
+        assert password is not None and len(password) >= 16
+        assert ensure_admin(session, NOW + timedelta(days=1), cheap=True) is None
+        assert ensure_admin(session, NOW, password="given by hand", cheap=True) == "given by hand"
+        factories.add_account(session, "ann")
+        with pytest.raises(ConflictError, match="'ann' has role 'annotator'"):
+            ensure_admin(session, NOW, name="ann")
+
+
+CHECKS = [
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_schema_conformance,
+]
+TESTED_ELSEWHERE = {  # streams do not end; readiness is a server error when nothing else runs
+    "/api/v1/rounds/{round_id}/events",
+    "/api/v1/campaigns/{campaign_id}/events",
+    "/api/v1/ready",
+}
+
+
+def test_random_requests_get_documented_answers_and_never_a_server_error(world: World) -> None:
+    """Every endpoint, as an admin, with requests that fit its schema."""
+    world.add_campaign(pairs=2)
+    schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", world.app)
+    tried = set()
+    for found in schema.get_all_operations():
+        operation = found.ok()
+        tried.add(operation.path)
+        if operation.path not in TESTED_ELSEWHERE:
+            _try_at_random(world, operation)
+    assert tried > TESTED_ELSEWHERE and len(tried) > 30
+
+
+def _try_at_random(world: World, operation: APIOperation) -> None:
+    with world.database.write() as session:  # a fresh one: revoking tokens is tried, too
+        token = factories.add_token(session, world.ids["ada"])
+
+    @given(case=operation.as_strategy())
+    @settings(
+        max_examples=5,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    def check(case: schemathesis.Case) -> None:
+        # Small ids, so that they meet rows.
+        case.path_parameters = {k: v % 3 + 1 for k, v in (case.path_parameters or {}).items()}
+        headers = {"Authorization": f"Bearer {token}"}
+        case.call_and_validate(headers=headers, checks=CHECKS)
+
+    check()
