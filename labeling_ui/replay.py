@@ -36,7 +36,7 @@ HOLD = 1.2  # s; the last frame stays this long before the client starts again
 # Sky blue and orange stay apart for every common kind of colour blindness (Okabe & Ito 2008).
 SIDE_COLOURS = {"A": (0, 114, 178), "B": (213, 94, 0)}
 PALE = 0.5  # how far the trail that is still to come is mixed with white
-MAT_PALE = 0.84
+MAT_PALE = 0.7
 TABLE_COLOUR = (226, 224, 219)
 HIT_COLOUR = (255, 196, 0)
 BACKGROUND = ((236, 240, 244), (206, 213, 221))  # top, bottom
@@ -160,7 +160,7 @@ class _Track:
             receive_shadow=False,
         )
         scene.add_label(
-            f"{root}/label", self._side.name, position=(0.5, -0.5, 0.03), font_screen_scale=2.2
+            f"{root}/label", self._side.name, position=(0.5, -0.49, 0.03), font_screen_scale=2.2
         )
 
     def _add_trail(self, scene: Any, root: str) -> list[Any]:

@@ -24,7 +24,7 @@ TABLE_GEOM = "table"
 MESH_CELL = 0.008  # m; vertices of the arm's drawing that are nearer than this are merged
 POSE_GRID = 2.0**-14  # m and quaternion units; rounding poses makes a replay 30 % smaller
 VISUAL_GROUP = 2  # geoms of higher groups are collision hulls and helpers
-ROBOT_COLOUR = (236, 239, 243)  # its files tint it green
+ROBOT_COLOUR = (224, 228, 234)  # its files tint it green
 
 
 @dataclass(frozen=True, eq=False)

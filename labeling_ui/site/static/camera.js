@@ -5,7 +5,7 @@ export const FIELD_OF_VIEW = 0.72; // rad, vertical; the recording sets the same
 // What must stay in the picture, in metres of the recording (labeling_ui/replay.py): the corners of
 // the table's used part with the letters, the robots' bases, and the highest point of the arms.
 const TABLE = [
-  [-0.98, -0.56, 0], [0.9, -0.56, 0], [-0.98, 0.44, 0], [0.9, 0.44, 0],
+  [-0.98, -0.6, 0], [0.9, -0.6, 0], [-0.98, 0.44, 0], [0.9, 0.44, 0],
 ];
 const ARMS = [[-0.95, 0, 0.72], [-0.3, 0.1, 0.7], [0.62, 0.1, 0.7]];
 

@@ -25,5 +25,6 @@ export function ago(text, now = Date.now()) {
   return new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
 }
 
-export const words = (name) => String(name ?? "").replaceAll("_", " ");
+const SPELLINGS = { finetuning: "fine-tuning", finetune: "fine-tune" };
+export const words = (name) => SPELLINGS[name] ?? String(name ?? "").replaceAll("_", " ");
 export const short = (digest) => String(digest ?? "").slice(0, 10);

@@ -178,7 +178,7 @@ function judge(choice) {
   if (history.length > MAX_HISTORY) history.shift();
   if (progress) progress = { done: progress.done + 1, remaining: Math.max(0, progress.remaining - 1) };
   leave(item);
-  toast(CHOICES[choice], { action: "Undo (Z)", onAction: undo });
+  toast(CHOICES[choice], { action: "Undo", onAction: undo });
   showNext();
 }
 
@@ -258,6 +258,7 @@ function tellNothing(reason) {
     all_done: ["All done", `There is no pair left for you.${thanks}`],
     no_pairs: ["Nothing to label yet", "No runs have been collected for this campaign so far."],
   }[reason] ?? ["Nothing to label", "Come back later."];
+  findAll(".choice").forEach((button) => button.classList.remove("chosen"));
   if (progress && reason === "all_done") progress = { done: progress.done, remaining: 0 };
   showProgress();
   setNote(
