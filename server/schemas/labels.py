@@ -9,7 +9,7 @@ from pydantic import AfterValidator, AwareDatetime, Field
 
 from server.handout import MAX_HOLD
 from server.labeling import ScreenChoice
-from server.schemas.common import Id, In, LongText, Out, Text
+from server.schemas.common import Id, In, JsonItem, LongText, Out, Text
 from server.states import AnnotatorKind, Choice, PairState
 
 MAX_REPLAY_EVENTS = 1000
@@ -70,7 +70,7 @@ class LabelCreate(In):
     client_time: ClientTime | None = None
     duration_ms: Milliseconds | None = None
     active_ms: Milliseconds | None = None
-    replay_events: Annotated[list[Any], Field(max_length=MAX_REPLAY_EVENTS)] = []
+    replay_events: Annotated[list[JsonItem], Field(max_length=MAX_REPLAY_EVENTS)] = []
     ui_version: Annotated[Text, Field(max_length=32)]
 
 

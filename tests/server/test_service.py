@@ -29,6 +29,7 @@ from tests.factories import NOW
 from tests.server.world import World
 
 ROOT = Path(__file__).parents[2]
+LABEL = '{"pair_id": 1, "choice": "left", "ui_version": "t", "replay_events": %s}'
 
 
 @pytest.mark.parametrize("module", ["server.app", "server.bootstrap", "server.rounds"])
@@ -85,6 +86,30 @@ def test_bodies_that_are_no_json_object_are_refused(sqlite_world: World, content
     answer = sqlite_world.client("ada").post("/annotators", content=content, headers=headers)
     assert answer.status_code in (400, 422)
     assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "words"),
+    [
+        ("/session", '{"name": "\\ud800", "password": "x"}', "surrogates not allowed"),
+        ("/session", '{"name": "x", "password": "\\ud800"}', "surrogates not allowed"),
+        ("/session", '{"name": "x\\u0000", "password": "x"}', "NUL"),
+        ("/labels", LABEL % "[NaN]", "nan is not a finite number"),
+        ("/labels", LABEL % '[{"t": 1e400}]', "inf is not a finite number"),
+        ("/labels", LABEL % '["\\ud800"]', "surrogates not allowed"),
+        ("/labels", LABEL % '[{"\\u0000": 1}]', "NUL"),
+        ("/labels", LABEL % ("[" * 50 + "]" * 50), "nested more than 8 levels"),
+        ("/campaigns/1/rounds", '{"config": {"\\ud800": 1}}', "unknown FinetuneConfig field"),
+    ],
+)
+def test_json_that_no_database_takes_is_refused(
+    sqlite_world: World, path: str, body: str, words: str
+) -> None:
+    sqlite_world.add_campaign(pairs=1)
+    headers = {"Content-Type": "application/json", "Idempotency-Key": "k"}
+    answer = sqlite_world.client("ada").post(path, content=body, headers=headers)
+    assert answer.status_code == 422
+    assert words in answer.json()["detail"]
 
 
 def test_a_huge_body_is_refused(sqlite_world: World) -> None:
