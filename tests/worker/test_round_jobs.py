@@ -250,6 +250,13 @@ def test_cancelled_round_stops_at_the_next_progress(
     assert world.job_of(JobKind.FINETUNE).state == JobState.CANCELLED
     assert _candidates(world) == []
 
+    # What it had written stays until the next round tidies up.
+    leftovers = world.bench.scratch(f"round-{round_id}")
+    assert leftovers.is_dir()
+    monkeypatch.undo()
+    _run(world, JobKind.FINETUNE, world.launch())
+    assert not leftovers.exists()
+
 
 def test_publish_job_that_dies_leaves_alias_and_history_as_they_were(
     world: World, monkeypatch: pytest.MonkeyPatch

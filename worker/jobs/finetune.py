@@ -30,6 +30,8 @@ from server.store.labels import snapshot_labels
 from server.store.tables import Checkpoint, Episode, Pair, Round
 from worker.attempt import Attempt
 
+WORKSPACE = "round-{}"  # name of the folder of partial results, by round id
+
 
 @dataclass(frozen=True)
 class Lesson:
@@ -59,12 +61,13 @@ def run(attempt: Attempt) -> None:
     with attempt.step() as session:
         rounds.move(session, attempt.bench.clock(), round_id, RoundState.FINETUNING)
         lesson = read_lesson(session, round_id)
+        remove_old_workspaces(session, attempt)
     attempt.progress("noise", 0.0)
     noise, config = choose_conservativeness(lesson)
     with attempt.step() as session:
         session.get_one(Round, round_id).noise = noise
     artifacts = attempt.bench.artifacts
-    workspace = attempt.bench.scratch(f"round-{round_id}")
+    workspace = attempt.bench.scratch(WORKSPACE.format(round_id))
     workspace.mkdir(parents=True, exist_ok=True)
     result = finetune(
         load_checkpoint(artifacts.get(lesson.parent_file)),
@@ -79,6 +82,13 @@ def run(attempt: Attempt) -> None:
         checkpoint_id = _store(session, attempt, result, file)
         attempt.finish(session, {"checkpoint_id": checkpoint_id, "seconds": attempt.seconds()})
     shutil.rmtree(workspace, ignore_errors=True)
+
+
+def remove_old_workspaces(session: Session, attempt: Attempt) -> None:
+    """Cancelled rounds leave their partial results behind; failed ones may still be retried."""
+    over = rounds.FINAL_STATES - {RoundState.FAILED}
+    for round_id in session.scalars(select(Round.id).where(Round.state.in_(over))):
+        shutil.rmtree(attempt.bench.scratch(WORKSPACE.format(round_id)), ignore_errors=True)
 
 
 def read_lesson(session: Session, round_id: int) -> Lesson:
