@@ -105,7 +105,11 @@ class Studio:
             job = Job(
                 kind=JobKind.COLLECT,
                 campaign_id=campaign.id,
-                payload={},
+                payload={
+                    "checkpoint_id": campaign.start_checkpoint_id,
+                    "episodes": 2 * len(sides),
+                    "seed": 0,
+                },
                 state=JobState.DONE,
                 created_at=now,
             )

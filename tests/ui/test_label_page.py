@@ -1,4 +1,4 @@
-"""The annotator's page in a real Chromium, on the real server: what is clicked is what SQL keeps."""
+"""The annotator's page in a real Chromium, on the real server: what is clicked, SQL keeps."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_next_pair_is_loaded_while_this_one_is_judged(studio: Studio, label_page
 
 
 def test_empty_campaign_says_so_and_shows_pairs_as_soon_as_they_are_ready(
-    studio: Studio, label_page: Opened, page: Page
+    studio: Studio, page: Page
 ) -> None:
     empty = LabelPage(page, studio, studio.add_annotator())
     empty.open(studio.add_campaign(), ready=False)
@@ -271,12 +271,14 @@ def test_phone_shows_both_runs_and_large_buttons(
     seen = page.evaluate(
         """async () => {
           const { project } = await import("/static/camera.js");
-          const point = (name) => new URLSearchParams(state.camera).get(name).split(",").map(Number);
-          const camera = { position: point("initialCameraPosition"), lookAt: point("initialCameraLookAt") };
+          const told = new URLSearchParams(state.camera);
+          const point = (name) => told.get("initialCamera" + name).split(",").map(Number);
+          const camera = { position: point("Position"), lookAt: point("LookAt") };
           const box = document.querySelector("#stage").getBoundingClientRect();
           const things = [];
           for (const x of [-0.48, 0.48]) {
-            things.push([x - 0.38, 0, 0], [x - 0.3, 0.1, 0.7], [x + 0.12, -0.49, 0.03], [x + 0.35, 0.4, 0]);
+            things.push([x - 0.38, 0, 0], [x - 0.3, 0.1, 0.7]);
+            things.push([x + 0.12, -0.49, 0.03], [x + 0.35, 0.4, 0]);
           }
           return things.map((thing) => project(thing, camera, box.width / box.height));
         }"""
@@ -304,9 +306,7 @@ def test_help_lists_the_keys_and_closes(studio: Studio, label_page: Opened) -> N
     assert studio.labels(driver.campaign_id) == []
 
 
-def test_missing_replay_is_reported_and_can_be_tried_again(
-    studio: Studio, label_page: Opened, page: Page
-) -> None:
+def test_missing_replay_is_reported_and_can_be_tried_again(studio: Studio, page: Page) -> None:
     campaign = studio.add_campaign([True])
     page.route("**/replays/*.viser", lambda route: route.fulfill(status=404))
     driver = LabelPage(page, studio, studio.add_annotator())

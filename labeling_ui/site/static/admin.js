@@ -3,6 +3,7 @@
 import { ApiError, get, post, signInAddress } from "./api.js";
 import { ask, describe, element, find, replace } from "./dom.js";
 import { count, words } from "./format.js";
+import { addPerson, drawPeople } from "./people.js";
 
 const box = find("#campaigns");
 
@@ -11,6 +12,7 @@ async function load() {
     const campaigns = await get("/campaigns");
     const cards = await Promise.all(campaigns.map(card));
     replace(box, cards.length > 0 ? cards : nothing());
+    await drawPeople();
   } catch (error) {
     if (error instanceof ApiError && error.status === 401) location.assign(signInAddress());
     replace(box, element("p.form-error", { role: "alert" }, describe(error)));
@@ -66,4 +68,5 @@ async function create() {
 }
 
 find("#new-campaign").addEventListener("click", create);
+find("#new-person").addEventListener("click", addPerson);
 load();

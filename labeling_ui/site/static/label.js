@@ -4,6 +4,7 @@ import { ApiError, OfflineError, request, signInAddress } from "./api.js";
 import { describe, element, find, findAll, replace, toast } from "./dom.js";
 import { Outbox } from "./outbox.js";
 import { Player, canDraw3d } from "./player.js";
+import * as notes from "./stage-notes.js";
 import { Transport } from "./transport.js";
 import { Watch } from "./watch.js";
 
@@ -14,7 +15,6 @@ const MAX_HISTORY = 50;
 
 const { campaignId, meId, uiVersion } = document.body.dataset;
 const stage = find("#stage");
-const note = find("#stage-note");
 const outbox = new Outbox(meId);
 const transport = new Transport();
 const has3d = canDraw3d();
@@ -47,7 +47,7 @@ async function showNext() {
   transport.attach(null);
   enableChoices(false);
   const mine = (turn += 1);
-  if (!note.textContent) tellLoading("Fetching the next pair");
+  if (!notes.shown()) notes.loading("Fetching the next pair");
   try {
     await outbox.flush(); // a label on its way would make the server offer its pair again
     const { handout, reason } = await fetchNext({ hold: 1 });
@@ -114,13 +114,13 @@ function show(item) {
   item.player.addEventListener("activity", () => item.watch?.input());
   item.player.addEventListener("failed", ({ detail }) => { if (current === item) tellFailedReplay(item, detail); });
   if (item.player.isReady) begin(item);
-  else tellLoading("Loading the replay");
+  else notes.loading("Loading the replay");
 }
 
 function begin(item) {
   item.watch?.close();
   item.watch = new Watch();
-  clearNote();
+  notes.clear();
   transport.attach(item.player);
   if (item.player.view !== transport.view) item.player.setView(transport.view);
   transport.begin();
@@ -135,7 +135,7 @@ function showPoster(item) {
   const { thumbnail_url: picture } = item.handout.pair;
   transport.attach(null);
   if (!picture) return tellFailedReplay(item, "This browser cannot draw 3D, and there is no picture.");
-  clearNote();
+  notes.clear();
   const about = "Paths of run A and run B seen from above";
   stage.append(element("img.poster", { src: picture, alt: about }));
   item.watch?.close();
@@ -230,69 +230,30 @@ outbox.addEventListener("change", ({ detail: { waiting, offline, signedOut } }) 
   replace(banner, element("span", {}, text), signedOut ? element("a", { href: signInAddress() }, "sign in") : null);
 });
 
-// ---- messages on the stage -------------------------------------------------------------------
-
-function setNote(...children) {
-  note.className = "stage-note veil";
-  replace(note, children);
-}
-
-function clearNote() {
-  note.className = "stage-note";
-  replace(note);
-}
-
-function tellLoading(text) {
-  setNote(element("div.spinner", { "aria-hidden": "true" }), element("p", {}, `${text}…`));
-}
-
-function again(label, action) {
-  return element("button.button", { type: "button", onclick: action }, label);
-}
+// ---- what went wrong, or why there is nothing -------------------------------------------------
 
 function tellNothing(reason) {
-  const done = history.length;
-  const thanks = done > 0 ? ` You judged ${done} ${done === 1 ? "pair" : "pairs"} here. Thank you.` : "";
-  const [title, text] = {
-    replays_waiting: ["The next replays are being made", "This page shows them as soon as they are ready."],
-    all_done: ["All done", `There is no pair left for you.${thanks}`],
-    no_pairs: ["Nothing to label yet", "No runs have been collected for this campaign so far."],
-  }[reason] ?? ["Nothing to label", "Come back later."];
   findAll(".choice").forEach((button) => button.classList.remove("chosen"));
   if (progress && reason === "all_done") progress = { done: progress.done, remaining: 0 };
   showProgress();
-  setNote(
-    reason === "replays_waiting" ? element("div.spinner", { "aria-hidden": "true" }) : null,
-    element("h2", {}, title), element("p", {}, text),
-    history.length > 0 ? again("Undo the last answer (Z)", undo) : null,
-  );
+  notes.nothing(reason, history.length, undo);
   stage.dataset.nothing = reason;
-  retryTimer = setTimeout(showNext, RETRY_MS[reason] ?? 10_000);
+  retryTimer = setTimeout(showNext, RETRY_MS[reason] ?? RETRY_MS.no_pairs);
 }
 
 function tellProblem(error) {
-  if (error instanceof ApiError && error.status === 401) {
-    setNote(element("h2", {}, "You are signed out"), element("a.button", { href: signInAddress() }, "Sign in"));
-    return;
-  }
-  if (error instanceof OfflineError) {
-    setNote(
-      element("h2", {}, "No connection to the server"),
-      element("p", {}, "Your answers are safe on this device. This page goes on by itself when the server answers."),
-      again("Try now", showNext),
-    );
+  if (error instanceof ApiError && error.status === 401) notes.signedOut();
+  else if (error instanceof OfflineError) {
+    notes.offline(showNext);
     retryTimer = setTimeout(showNext, RETRY_MS.offline);
-    return;
-  }
-  setNote(element("h2", {}, "That did not work"), element("p", {}, describe(error)), again("Try again", showNext));
+  } else notes.problem("That did not work", describe(error), showNext);
 }
 
 function tellFailedReplay(item, message) {
-  const retry = () => {
+  notes.problem("The replay is not there", message, () => {
     item.player?.close();
     show(makeReplay(item.handout, true));
-  };
-  setNote(element("h2", {}, "The replay is not there"), element("p", {}, message), again("Try again", retry));
+  });
 }
 
 // ---- keys and buttons ------------------------------------------------------------------------

@@ -1,0 +1,49 @@
+// Cards of what is running now: rounds with their stages, and collections.
+
+import { element, find } from "./dom.js";
+import { percent, words } from "./format.js";
+
+const STAGES = [["queued", "Queued"], ["finetuning", "Fine-tuning"], ["evaluating", "Evaluation"], ["gating", "Gate"]];
+const RUNNING = STAGES.map(([state]) => state);
+
+export const isRunning = (round) => RUNNING.includes(round.state);
+
+function meter(job) {
+  const share = job?.progress ?? 0;
+  const now = { role: "progressbar", "aria-valuenow": Math.round(100 * share), "aria-valuemin": 0, "aria-valuemax": 100 };
+  return [
+    element("div.meter", now, element("div", { style: `width:${100 * share}%` })),
+    element("p.small.muted.live-stage", {}, job ? `${words(job.stage) || "waiting"} · ${percent(share)}` : "waiting for a worker"),
+  ];
+}
+
+export function liveRound(round, job, onCancel) {
+  const now = RUNNING.indexOf(round.state);
+  const steps = STAGES.map(([, name], index) =>
+    element(`li${index < now ? ".past" : index === now ? ".now" : ""}`, {}, name));
+  return element(
+    "div.card.live", { dataset: { liveRound: round.id, job: job?.id } },
+    element(
+      "div.live-head", {},
+      element("h2", {}, `Round ${round.id} is running`),
+      element("span.muted", {}, `${round.config.method} on ${round.labels} labels`),
+      element("button.button.small", { type: "button", onclick: onCancel }, "Cancel"),
+    ),
+    element("ul.stages", {}, steps), meter(job),
+  );
+}
+
+export function liveCollect(job) {
+  return element(
+    "div.card.live", { dataset: { job: job.id } },
+    element("div.live-head", {}, element("h2", {}, "Collecting runs of the published policy")), meter(job),
+  );
+}
+
+// Moves the meter at once; everything else follows with the next refresh.
+export function showProgress({ job_id: jobId, progress, stage }) {
+  const card = find(`.live[data-job="${jobId}"]`);
+  if (!card || typeof progress !== "number") return;
+  find(".meter > div", card).style.width = `${100 * progress}%`;
+  find(".live-stage", card).textContent = `${words(stage)} · ${percent(progress)}`;
+}

@@ -1,0 +1,73 @@
+// The accounts of the studio: who may label, who may administer; new accounts and passwords.
+
+import { get, post, request } from "./api.js";
+import { ask, element, find, replace, toast } from "./dom.js";
+import { count } from "./format.js";
+import { table } from "./panels.js";
+
+const ROLES = [["annotator", "Annotator: labels"], ["admin", "Admin: everything"], ["service", "Service: scripts"]];
+const PASSWORD_HINT = "At least 8 characters. Tell it to the person yourself.";
+
+export async function drawPeople() {
+  const people = await get("/annotators");
+  const heads = [["Name"], ["Role"], ["Labels", "number"], [""]];
+  replace(find("#people"), table(heads, people.map(row), "Nobody."));
+}
+
+function row(person) {
+  const change = (text, action) => element("button.button.small", { type: "button", onclick: action }, text);
+  return element(
+    "tr", { dataset: { person: person.id } },
+    element("td", {}, person.name, person.active ? null : element("span.under", {}, "deactivated")),
+    element("td", {}, person.role, person.kind === "simulated" ? element("span.under", {}, "simulated") : null),
+    element("td.number", {}, count(person.labels)),
+    element(
+      "td.tight", {}, change("Password", () => setPassword(person)), " ",
+      person.active ? change("Deactivate", () => deactivate(person)) : change("Activate", () => activate(person)),
+    ),
+  );
+}
+
+const patch = (person, body) => request("PATCH", `/annotators/${person.id}`, { body });
+
+export async function addPerson() {
+  const made = await ask({
+    title: "New account",
+    confirm: "Create",
+    fields: [
+      { name: "name", label: "Name", required: true },
+      { name: "role", label: "Role", kind: "select", options: ROLES },
+      { name: "password", label: "Password", kind: "password", required: true, hint: PASSWORD_HINT },
+    ],
+    onSubmit: (values) => post("/annotators", values),
+  });
+  if (made) toast(`${made.name} can sign in now.`);
+  await drawPeople();
+}
+
+async function setPassword(person) {
+  const done = await ask({
+    title: `New password for ${person.name}`,
+    text: "Signs this person out everywhere.",
+    confirm: "Set password",
+    fields: [{ name: "password", label: "Password", kind: "password", required: true, hint: PASSWORD_HINT }],
+    onSubmit: ({ password }) => patch(person, { password }),
+  });
+  if (done) toast("The password is changed.");
+}
+
+async function deactivate(person) {
+  await ask({
+    title: `Deactivate ${person.name}?`,
+    text: "This person is signed out and cannot come back until activated again. All labels stay.",
+    confirm: "Deactivate",
+    danger: true,
+    onSubmit: () => patch(person, { active: false }),
+  });
+  await drawPeople();
+}
+
+async function activate(person) {
+  await patch(person, { active: true });
+  await drawPeople();
+}

@@ -1,0 +1,254 @@
+"""The campaign page in a real Chromium: buttons do what they say, and rounds are seen live."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+
+import pytest
+from playwright.sync_api import Page
+from sqlalchemy import select
+
+from server import rounds
+from server.labeling import ScreenChoice
+from server.states import JobKind, JobState, Role, RoundState
+from server.store.tables import Campaign, Job, Publication, Round
+from tests.ui.driving import sign_in, until
+from tests.ui.rounds import WorkerStandIn, evaluation, label_all
+from tests.ui.studio import PASSWORD, Studio
+
+pytestmark = pytest.mark.browser
+
+
+def open_campaign(page: Page, studio: Studio, campaign_id: int) -> None:
+    """Sign in as admin and open the campaign's page."""
+    page.set_viewport_size({"width": 1200, "height": 800})
+    sign_in(page, studio, "admin", f"/admin/campaigns/{campaign_id}")
+    page.locator(".tile").first.wait_for()
+
+
+def confirm(page: Page, name: str) -> None:
+    """The dialog's button, and the dialog gone."""
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_role("button", name=name).click()
+    dialog.wait_for(state="detached")
+
+
+def tile(page: Page, name: str) -> str:
+    """The figure on a tile."""
+    return page.locator(".tile", has_text=name).locator(".value").first.inner_text()
+
+
+def test_new_campaign_is_made_in_the_dialog_and_opened(studio: Studio, page: Page) -> None:
+    sign_in(page, studio, "admin", "/admin")
+    page.get_by_role("button", name="New campaign").click()
+    dialog = page.get_by_role("dialog", name="New campaign")
+    name = studio.new_name("by dialog")
+    dialog.get_by_label("Name").fill(name)
+    criterion = dialog.get_by_label("What annotators are asked")
+    assert "cylinder" in criterion.input_value(), "the task's own criterion is the proposal"
+    criterion.fill("Stay far from the cylinders.")
+    dialog.get_by_label("Labels per pair").fill("2")
+    dialog.get_by_role("button", name="Create").click()
+    page.get_by_role("heading", name=name).wait_for()
+    with studio.database.read() as session:
+        made = session.scalars(select(Campaign).where(Campaign.name == name)).one()
+    assert made.criterion == "Stay far from the cylinders."
+    assert made.settings["labels_per_pair"] == 2
+    assert page.url.endswith(f"/admin/campaigns/{made.id}")
+
+
+def test_name_that_is_taken_is_refused_in_the_dialog(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    with studio.database.read() as session:
+        name = session.get_one(Campaign, campaign).name
+    sign_in(page, studio, "admin", "/admin")
+    page.get_by_role("button", name="New campaign").click()
+    page.get_by_label("Name").fill(name)
+    page.get_by_role("button", name="Create").click()
+    assert name in page.get_by_role("dialog").get_by_role("alert").inner_text()
+
+
+def test_collect_button_queues_the_job_with_the_numbers_asked_for(
+    studio: Studio, page: Page
+) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Collect runs").click()
+    page.get_by_label("Runs", exact=True).fill("12")
+    page.get_by_label("Pairs", exact=True).fill("7")
+    confirm(page, "Collect")
+    page.get_by_role("heading", name="Collecting runs of the published policy").wait_for()
+    with studio.database.read() as session:
+        wanted = select(Job).where(Job.campaign_id == campaign, Job.state == JobState.QUEUED)
+        job = session.scalars(wanted).one()
+    assert job.kind == JobKind.COLLECT
+    assert (job.payload["episodes"], job.payload["pairs"]) == (12, 7)
+
+
+def test_round_without_labels_is_refused_with_the_servers_words(studio: Studio, page: Page) -> None:
+    open_campaign(page, studio, studio.add_campaign([True]))
+    page.get_by_role("button", name="Start round").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_role("button", name="Start round").click()
+    assert "label" in dialog.get_by_role("alert").inner_text()
+    dialog.get_by_role("button", name="Cancel").click()
+
+
+def test_round_is_followed_live_published_and_rolled_back(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign([True, False, True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    open_campaign(page, studio, campaign)
+    assert tile(page, "Labels") == "3"
+    page.get_by_role("button", name="Start round").click()
+    page.get_by_label("Conservativeness").fill("0.35")
+    confirm(page, "Start round")
+
+    live = page.locator(".live")
+    live.get_by_text("is running").wait_for()
+    with studio.database.read() as session:
+        this = session.scalars(select(Round).where(Round.campaign_id == campaign)).one()
+        start = session.get_one(Campaign, campaign).published_checkpoint_id
+    assert this.config["conservativeness"] == 0.35
+
+    worker = WorkerStandIn(studio, this.id)
+    worker.start()
+    live.locator("li.now", has_text="Fine-tuning").wait_for()
+    worker.progress("score", 0.25, loss=1.5, mean_vote=0.5)
+    worker.progress("score", 0.5, loss=math.exp(-1), mean_vote=0.6)
+    live.get_by_text("score · 50 %").wait_for()
+    page.locator("#loss-chart .scatterlayer .trace").first.wait_for()
+    page.locator("#vote-chart .scatterlayer .trace").first.wait_for()
+
+    candidate = worker.finish(evaluation(22, 70, 8), evaluation(91, 3, 6))
+    page.locator("#rounds").get_by_text("published").wait_for()
+    live.wait_for(state="detached")
+    assert tile(page, "Alignment, published") == "91 %"
+    assert "22 % → 91 %" in page.locator("#rounds").inner_text()
+    before, after = page.locator("#behaviour svg").all()
+    lefts = 'polyline[data-group="left"]'
+    assert (before.locator(lefts).count(), after.locator(lefts).count()) == (22, 91)
+    assert before.locator("circle").count() == 7  # six cylinders and the start
+
+    page.locator(f'[data-checkpoint="{candidate}"]').get_by_role("button", name="Lineage").click()
+    story = page.get_by_role("dialog", name="Lineage").inner_text()
+    assert "3 labels" in story and "pretrained, no labels behind it" in story
+    page.get_by_role("dialog").get_by_role("button", name="Close").click()
+
+    page.get_by_role("button", name="Roll back").click()
+    page.get_by_label("Reason").fill("looked odd on the robot")
+    confirm(page, "Roll back")
+    published = page.locator(f'[data-checkpoint="{start}"]').get_by_text("published")
+    published.wait_for()
+    with studio.database.read() as session:
+        assert session.get_one(Campaign, campaign).published_checkpoint_id == start
+        last = session.scalars(select(Publication).order_by(Publication.id.desc())).first()
+    assert last is not None
+    assert (last.action, last.reason) == ("rollback", "looked odd on the robot")
+
+    page.locator(f'[data-checkpoint="{candidate}"]').get_by_role("button", name="Publish").click()
+    confirm(page, "Publish")
+    page.locator(f'[data-checkpoint="{candidate}"]').get_by_text("published").wait_for()
+    with studio.database.read() as session:
+        assert session.get_one(Campaign, campaign).published_checkpoint_id == candidate
+
+
+def test_running_round_can_be_cancelled(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Start round").click()
+    confirm(page, "Start round")
+    page.locator(".live").get_by_role("button", name="Cancel").click()
+    confirm(page, "Cancel round")
+    page.locator("#rounds").get_by_text("cancelled").wait_for()
+
+
+def test_failed_job_shows_its_error_and_is_queued_again_on_retry(
+    studio: Studio, page: Page
+) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Start round").click()
+    confirm(page, "Start round")
+    page.locator(".live").wait_for()
+    with studio.database.write() as session:
+        this = session.scalars(select(Round).where(Round.campaign_id == campaign)).one()
+        job = session.scalars(select(Job).where(Job.round_id == this.id)).one()
+        job.state, job.error = JobState.FAILED, "no space left on the disk"
+        rounds.move(session, datetime.now(UTC), this.id, RoundState.FAILED, error="disk")
+    page.locator("#jobs").get_by_text("no space left on the disk").wait_for()
+    page.locator("#jobs").get_by_role("button", name="Retry").click()
+    page.get_by_text(f"Job {job.id} is queued again.").wait_for()
+    with studio.database.read() as session:
+        assert session.get_one(Job, job.id).state == JobState.QUEUED
+
+
+def test_pairs_and_annotators_are_shown(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign([True, False])
+    name = studio.add_annotator()
+    label_all(studio, campaign, name, ScreenChoice.LEFT)
+    open_campaign(page, studio, campaign)
+    row = page.locator("#annotators tr", has_text=name).inner_text()
+    assert "100 %" in row  # always the left side
+    pictures = page.locator("#pairs img")
+    assert pictures.count() == 2
+    loaded = "[...document.querySelectorAll('#pairs img')].every((image) => image.naturalWidth)"
+    pictures.first.scroll_into_view_if_needed()
+    until(page, loaded)
+
+
+def test_annotators_are_kept_out_of_the_admin_pages(studio: Studio, page: Page) -> None:
+    name = studio.add_annotator(Role.ANNOTATOR)
+    page.goto(f"{studio.url}/admin")
+    page.get_by_label("Name").fill(name)
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Sign in").click()
+    page.wait_for_url("**/label*")
+    page.goto(f"{studio.url}/admin")
+    assert "/label" in page.url
+
+
+def test_sign_out_ends_the_session(studio: Studio, page: Page) -> None:
+    sign_in(page, studio, studio.add_annotator(), "/label")
+    page.get_by_label("Account of").click()
+    page.get_by_role("button", name="Sign out").click()
+    page.wait_for_url(f"{studio.url}/sign-in")
+    page.goto(f"{studio.url}/label")
+    assert "/sign-in" in page.url
+
+
+def test_settings_are_changed_in_the_dialog(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("What annotators are asked").fill("Slow is better.")
+    page.get_by_label("Start a round by itself").fill("40")
+    confirm(page, "Save")
+    page.get_by_text("Slow is better.").wait_for()
+    with studio.database.read() as session:
+        row = session.get_one(Campaign, campaign)
+    assert row.criterion == "Slow is better."
+    assert row.settings["round_after_labels"] == 40
+
+
+def test_new_account_can_sign_in_until_it_is_deactivated(studio: Studio, page: Page) -> None:
+    sign_in(page, studio, "admin", "/admin")
+    name = studio.new_name("guest")
+    page.get_by_role("button", name="New account").click()
+    page.get_by_label("Name").fill(name)
+    page.get_by_label("Password").fill("short")
+    page.get_by_role("button", name="Create").click()
+    assert "8" in page.get_by_role("dialog").get_by_role("alert").inner_text()
+    page.get_by_label("Password").fill(PASSWORD)
+    confirm(page, "Create")
+    row = page.locator("#people tr", has_text=name)
+    guest = page.context.browser.new_context().new_page()  # type: ignore[union-attr]
+    sign_in(guest, studio, name, "/label")
+    row.get_by_role("button", name="Deactivate").click()
+    confirm(page, "Deactivate")
+    row.get_by_text("deactivated").wait_for()
+    guest.goto(f"{studio.url}/label")
+    assert "/sign-in" in guest.url
+    guest.context.close()
