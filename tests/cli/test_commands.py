@@ -44,7 +44,7 @@ def test_evaluate_prints_rates_and_intervals_of_a_file(
     assert measured["n"] == 3
     assert 0 <= measured["intervals"]["success"][0] <= measured["success"] <= 1
     assert main(["evaluate", str(file), "--n", "3", "--seed", "7"]) == 0
-    assert "off-support" in capsys.readouterr().out
+    assert "off support" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

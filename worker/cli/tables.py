@@ -27,7 +27,7 @@ def evaluation_table(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) 
 
     table = Table(title=title, title_justify="left")
     table.add_column("policy", no_wrap=True)
-    for heading in ("success", "alignment", "of successes", "off-support", "n"):
+    for heading in ("success", "alignment", "of successes", "off support", "n"):
         table.add_column(heading, justify="right")
     for name, evaluation in rows:
         table.add_row(
