@@ -95,7 +95,7 @@ def _panel(
     draw = ImageDraw.Draw(panel)
     place = _fit(shapes)
     colour = SIDE_COLOURS[name]
-    for shape in shapes:
+    for shape in sorted(shapes, key=lambda shape: shape["type"] != "workspace"):
         _draw_shape(draw, place, shape)
     path = [place.point(float(x), float(y)) for x, y in trajectory.paths[:, :2]]
     draw.line(path, fill=_pale(colour), width=DETAIL, joint="curve")

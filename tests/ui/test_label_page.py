@@ -123,6 +123,24 @@ def test_what_was_watched_is_stored_with_the_label(studio: Studio, label_page: O
     assert seek["to"] == 1 and seek["at"] > 0
 
 
+def test_active_time_stops_after_a_minute_without_input(studio: Studio, page: Page) -> None:
+    page.goto(f"{studio.url}/sign-in")
+    spent = page.evaluate(
+        """async () => {
+          const { Watch } = await import("/static/watch.js");
+          let now = 1000;
+          const watch = new Watch(() => now);
+          now += 10_000;
+          watch.input();  // 10 s of work, then five minutes away: a minute of them counts
+          now += 300_000;
+          watch.input();
+          now += 5_000;
+          return watch.summary();
+        }"""
+    )
+    assert spent == {"duration_ms": 315_000, "active_ms": 75_000, "replay_events": []}
+
+
 def test_undo_opens_the_same_pair_again_and_adds_rows(studio: Studio, label_page: Opened) -> None:
     campaign = studio.add_campaign([False, False])
     driver = label_page(campaign)
@@ -208,6 +226,25 @@ def test_label_given_without_network_is_kept_and_sent_once_later(
     until(driver.page, "document.querySelector('#banner').hidden")
     assert driver.page.evaluate(stored) == 0
     assert [row.choice for row in studio.labels(campaign)] == [Choice.FIRST]
+
+
+def test_undo_without_network_goes_out_in_order_when_it_is_back(
+    studio: Studio, label_page: Opened, context: BrowserContext
+) -> None:
+    campaign = studio.add_campaign([True])
+    driver = label_page(campaign)
+    pair = driver.wait_ready()
+    context.set_offline(True)
+    driver.press("ArrowLeft")
+    driver.page.get_by_text("No connection to the server").wait_for()
+    driver.press("z")
+    assert driver.wait_ready() == pair
+    driver.press("ArrowRight")
+    driver.page.get_by_text("3 answers are kept on this device").wait_for()
+    context.set_offline(False)
+    label, retraction, second = studio.wait_for_labels(campaign, 3)
+    assert (label.choice, retraction.supersedes_id) == (Choice.FIRST, label.id)
+    assert (second.choice, second.supersedes_id) == (Choice.SECOND, retraction.id)
 
 
 def test_label_whose_answer_was_lost_is_stored_once(

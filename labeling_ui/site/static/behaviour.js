@@ -72,11 +72,13 @@ export function pathMap(title, evaluation, facts) {
   const picture = svg(
     "svg",
     { viewBox: `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`, role: "img", "aria-label": `${title}: ${paths.length} paths seen from above` },
-    facts.scene.map(sceneShape), paths,
+    [...facts.scene].sort(workspaceFirst).map(sceneShape), paths,
   );
   const caption = evaluation ? `${title} · ${paths.length} of ${evaluation.n} runs` : title;
   return element("figure", {}, element("figcaption", {}, caption), picture);
 }
+
+const workspaceFirst = (one, other) => (other.type === "workspace") - (one.type === "workspace");
 
 function sceneShape(shape) {
   if (shape.type === "cylinder") {

@@ -21,7 +21,7 @@ const has3d = canDraw3d();
 
 let current = null; // {handout, player | null, watch, shownAt}
 let upcoming = []; // pairs of the same form that come next, first one first
-const history = []; // what was judged here, the newest last: {handout, key, choice}
+const history = []; // what was judged here, the newest last: {item, key, choice}
 let progress = null; // {done, remaining} as of the last answer, counted on from there
 let retryTimer = null;
 let turn = 0; // counts what is put on stage, so that a late answer does not push something else off
@@ -174,7 +174,8 @@ function judge(choice) {
     ...item.watch.summary(),
     ui_version: uiVersion,
   });
-  history.push({ handout: item.handout, key, choice });
+  history.at(-1)?.item.player?.close();
+  history.push({ item, key, choice });
   if (history.length > MAX_HISTORY) history.shift();
   if (progress) progress = { done: progress.done + 1, remaining: Math.max(0, progress.remaining - 1) };
   leave(item);
@@ -182,12 +183,18 @@ function judge(choice) {
   showNext();
 }
 
+// The replay stays behind the stage until the next answer: undo then works at once, also offline.
 function leave(item) {
-  item.watch?.close();
-  item.player?.close();
+  setAside(item);
   stage.querySelector(".poster")?.remove();
   delete stage.dataset.pairId;
   current = null;
+}
+
+function setAside(item) {
+  item.watch?.close();
+  item.player?.setActive(false);
+  item.player?.send("pause");
 }
 
 function undo() {
@@ -195,15 +202,15 @@ function undo() {
   if (!last) return toast("There is nothing to undo on this page.");
   outbox.undo(last.key);
   if (current) {
-    current.player?.setActive(false);
-    current.player?.send("pause");
-    current.watch?.close();
+    setAside(current);
     enableChoices(false);
     upcoming.unshift(current);
   }
   clearTimeout(retryTimer);
   if (progress) progress = { done: Math.max(0, progress.done - 1), remaining: progress.remaining + 1 };
-  show({ ...makeReplay(last.handout, true), reopened: true });
+  const { item } = last;
+  if (!item.player || item.player.closed) Object.assign(item, makeReplay(item.handout, true), { wired: false });
+  show(Object.assign(item, { reopened: true }));
   toast(`Taken back: ${CHOICES[last.choice]}. Judge this pair again.`);
 }
 
