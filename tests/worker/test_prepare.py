@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -18,15 +19,32 @@ from server.store.session import Database
 from server.store.tables import Annotator, Campaign, Checkpoint
 from tests.core.learning import tiny_checkpoint
 from worker import prepare as preparing
-from worker.prepare import prepare, shipped_bytes
+from worker.prepare import Prepared, prepare, shipped_bytes
+
+TINY = save_checkpoint(tiny_checkpoint())
+
+
+def _settings(folder: Path) -> Settings:
+    return Settings(_env_file=None, state_dir=folder, argon2_cheap=True)
+
+
+@pytest.fixture(scope="module")
+def first_time(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Prepared]:
+    """A folder prepared once; a tiny policy stands for the shipped one."""
+    folder = tmp_path_factory.mktemp("first")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preparing, "shipped_bytes", lambda _task: TINY)
+        return folder, prepare(_settings(folder))
 
 
 @pytest.fixture
-def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
-    """Settings of an empty folder; a tiny policy stands for the shipped one."""
-    blob = save_checkpoint(tiny_checkpoint())
-    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: blob)
-    return Settings(_env_file=None, state_dir=tmp_path, argon2_cheap=True)
+def settings(
+    first_time: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Settings:
+    """A copy of the prepared folder."""
+    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: TINY)
+    shutil.copytree(first_time[0], tmp_path / "state")
+    return _settings(tmp_path / "state")
 
 
 def _rows(settings: Settings) -> tuple[list[str], list[Checkpoint], list[Campaign]]:
@@ -39,9 +57,10 @@ def _rows(settings: Settings) -> tuple[list[str], list[Checkpoint], list[Campaig
 
 
 def test_empty_folder_gets_admin_checkpoint_and_a_campaign_that_can_start(
-    settings: Settings,
+    first_time: tuple[Path, Prepared],
 ) -> None:
-    prepared = prepare(settings)
+    folder, prepared = first_time
+    settings = _settings(folder)
     assert prepared.password is not None and len(prepared.password) >= 12
     names, (checkpoint,), (campaign,) = _rows(settings)
     assert names == ["admin"]
@@ -56,7 +75,6 @@ def test_empty_folder_gets_admin_checkpoint_and_a_campaign_that_can_start(
 
 
 def test_second_time_changes_nothing_and_shows_no_password(settings: Settings) -> None:
-    prepare(settings)
     before = _rows(settings)
     assert prepare(settings).password is None
     after = _rows(settings)
@@ -64,14 +82,12 @@ def test_second_time_changes_nothing_and_shows_no_password(settings: Settings) -
 
 
 def test_given_password_replaces_a_forgotten_one(settings: Settings) -> None:
-    prepare(settings)
     assert prepare(settings, admin_password="a new beginning").password == "a new beginning"
 
 
 def test_newer_shipped_checkpoint_is_added_beside_the_old_one(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prepare(settings)
     newer = save_checkpoint(tiny_checkpoint(seed=1))
     monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: newer)
     prepare(settings)
