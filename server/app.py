@@ -10,7 +10,7 @@ from fastapi import FastAPI
 
 from server import pages
 from server.api import accounts, campaigns, errors, events, health, labels, rounds
-from server.api.guards import SameOriginGuard
+from server.api.guards import CarefulBrowsers, SameOriginGuard
 from server.api.services import Services
 from server.queue import SendJob, make_sender
 from server.schemas.common import Problem
@@ -69,4 +69,5 @@ def create_app(
         app.include_router(module.router, prefix=API_PREFIX)
     pages.install(app)
     app.add_middleware(SameOriginGuard)
+    app.add_middleware(CarefulBrowsers)
     return app

@@ -22,6 +22,7 @@ from server.store import jobs
 from server.store.events import audit
 from server.store.labels import is_effective
 from server.store.pairs import count_by_state
+from server.store.session import LOCK
 from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Job, Label, Pair
 
 
@@ -113,7 +114,7 @@ def change_campaign(
     Raises NotFoundError; ConflictError for a taken name, or for another criterion once there are
     labels, because they were given under the old one.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update={"key_share": True})
+    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     changed: dict[str, Any] = {}
@@ -156,9 +157,7 @@ def start_collect(
     Raises NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more
     pairs than the episodes can form.
     """
-    campaign = session.get(
-        Campaign, campaign_id, with_for_update={"key_share": True}, populate_existing=True
-    )
+    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     if campaign.archived:

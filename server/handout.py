@@ -17,7 +17,6 @@ from server.store.pairs import (
     count_taken,
     live_leases,
     open_pairs,
-    taken_by_others,
 )
 from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pair
 
@@ -106,7 +105,6 @@ def _take_open_pair(
         query = (
             open_pairs(now, campaign.id, annotator_id, labels_per_pair=wanted)
             .where(Pair.id.not_in(refused))
-            .order_by(taken_by_others(now, annotator_id), Pair.id)
             .limit(1)
             .with_for_update(of=Pair, key_share=True, skip_locked=skip_locked)
         )
@@ -148,7 +146,9 @@ def handout(session: Session, now: datetime, campaign: Campaign, lease: Lease) -
         lease.annotator_id,
         labels_per_pair=int(campaign.settings["labels_per_pair"]),
     )
-    counted = session.execute(select(func.count()).select_from(still_open.subquery())).scalar_one()
+    counted = session.execute(
+        select(func.count()).select_from(still_open.order_by(None).subquery())
+    ).scalar_one()
     held = len(live_leases(session, now, campaign.id, lease.annotator_id))
     return Handout(
         lease=lease,

@@ -19,6 +19,7 @@ from server.sign_in import Me
 from server.states import AnnotatorKind, Choice
 from server.store.events import add_event
 from server.store.labels import newest_label
+from server.store.session import LOCK
 from server.store.tables import Campaign, Episode, Label, Lease, Pair, SimulatedTruth
 
 
@@ -150,7 +151,7 @@ def undo_label(
 
 def _locked_pair(session: Session, pair_id: int) -> Pair:
     """Lock the row: answers to one pair come one after the other on every engine."""
-    pair = session.get(Pair, pair_id, with_for_update={"key_share": True}, populate_existing=True)
+    pair = session.get(Pair, pair_id, with_for_update=LOCK, populate_existing=True)
     if pair is None:
         raise NotFoundError("pair", pair_id)
     return pair

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from server.errors import ConflictError, NotFoundError
 from server.states import PublishRule
 from server.store.events import add_event, audit
+from server.store.session import LOCK
 from server.store.tables import Campaign, Checkpoint, Publication, Round
 
 
@@ -85,7 +86,7 @@ def record_start(session: Session, now: datetime, campaign: Campaign, *, by: int
 
 
 def _locked_campaign(session: Session, campaign_id: int) -> Campaign:
-    campaign = session.get(Campaign, campaign_id, with_for_update=True, populate_existing=True)
+    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     return campaign

@@ -31,6 +31,7 @@ from server.states import (
 from server.store import jobs
 from server.store.events import add_event, audit
 from server.store.labels import effective_label_ids, snapshot_labels
+from server.store.session import LOCK
 from server.store.tables import Campaign, Job, LabelSnapshot, Pair, Round
 
 FINAL_STATES = frozenset(
@@ -112,7 +113,7 @@ def launch(
     round of the campaign may still publish; UnknownNameError or ValueOutOfRangeError for a wrong
     configuration.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update=True, populate_existing=True)
+    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     if campaign.archived:
@@ -317,7 +318,7 @@ def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger 
 
 def launch_due(session: Session, now: datetime, campaign_id: int) -> Round | None:
     """Start the round that is due, if one is; two ticks at once start one round."""
-    campaign = session.get(Campaign, campaign_id, with_for_update=True, populate_existing=True)
+    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     trigger = is_due(session, now, campaign)

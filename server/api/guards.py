@@ -1,12 +1,12 @@
-"""The same-origin check in front of all endpoints."""
+"""In front of all endpoints: the same-origin check, and headers that make browsers careful."""
 
 from __future__ import annotations
 
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.api.errors import problem
 
@@ -47,3 +47,20 @@ class SameOriginGuard:
                 await answer(scope, receive, send)
                 return
         await self.app(scope, receive, send)
+
+
+class CarefulBrowsers:
+    """Adds headers: believe the stated content type, tell other sites nothing."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers.setdefault("X-Content-Type-Options", "nosniff")
+                headers.setdefault("Referrer-Policy", "same-origin")
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime
 
-from sqlalchemy import ColumnElement, ScalarSelect, Select, func, select
+from sqlalchemy import ColumnElement, Select, func, select, union_all
 from sqlalchemy.orm import Session
 
 from server.states import PairState
@@ -29,52 +29,48 @@ def _is_live(now: datetime) -> ColumnElement[bool]:
     return Lease.closed_at.is_(None) & (Lease.expires_at > now)
 
 
-def taken_by_others(now: datetime, annotator_id: int) -> ScalarSelect[int]:
-    """Correlated count: labels in force on Pair by others plus leases that others hold."""
-    labels = (
-        select(func.count())
-        .select_from(Label)
-        .where(Label.pair_id == Pair.id, Label.annotator_id != annotator_id, is_effective())
-        .correlate(Pair)
-        .scalar_subquery()
-    )
-    leases = (
-        select(func.count())
-        .select_from(Lease)
-        .where(Lease.pair_id == Pair.id, Lease.annotator_id != annotator_id, _is_live(now))
-        .correlate(Pair)
-        .scalar_subquery()
-    )
-    return labels + leases  # type: ignore[return-value]  # a sum of scalars is a scalar
-
-
 def open_pairs(
     now: datetime, campaign_id: int, annotator_id: int, *, labels_per_pair: int
 ) -> Select[Pair]:
-    """Ready pairs with room for one more label, which this annotator has neither done nor got."""
-    done = (
-        select(Label.id)
-        .where(Label.pair_id == Pair.id, Label.annotator_id == annotator_id, is_effective())
-        .correlate(Pair)
+    """Ready pairs with room for one more label, which this annotator has neither done nor got.
+
+    Those with most room come first. Sets instead of a look-up per pair: with thousands of pairs
+    that is many times faster on both engines.
+    """
+    labels = select(Label.pair_id).where(Label.campaign_id == campaign_id, is_effective())
+    leases = select(Lease.pair_id).where(_is_live(now))
+    others = union_all(
+        labels.where(Label.annotator_id != annotator_id),
+        leases.where(Lease.annotator_id != annotator_id),
+    ).subquery()
+    taken = (
+        select(others.c.pair_id, func.count().label("count")).group_by(others.c.pair_id).subquery()
     )
-    held = (
-        select(Lease.id)
-        .where(Lease.pair_id == Pair.id, Lease.annotator_id == annotator_id, _is_live(now))
-        .correlate(Pair)
-    )
-    return select(Pair).where(
-        Pair.campaign_id == campaign_id,
-        Pair.state == PairState.READY,
-        ~done.exists(),
-        ~held.exists(),
-        taken_by_others(now, annotator_id) < labels_per_pair,
+    count = func.coalesce(taken.c["count"], 0)
+    return (
+        select(Pair)
+        .outerjoin(taken, taken.c.pair_id == Pair.id)
+        .where(
+            Pair.campaign_id == campaign_id,
+            Pair.state == PairState.READY,
+            Pair.id.not_in(labels.where(Label.annotator_id == annotator_id)),
+            Pair.id.not_in(leases.where(Lease.annotator_id == annotator_id)),
+            count < labels_per_pair,
+        )
+        .order_by(count, Pair.id)
     )
 
 
 def count_taken(session: Session, now: datetime, pair_id: int, annotator_id: int) -> int:
-    """`taken_by_others` of one pair, in a statement of its own (and so with fresh eyes)."""
-    query = select(taken_by_others(now, annotator_id)).select_from(Pair).where(Pair.id == pair_id)
-    return session.execute(query).scalar_one()
+    """Labels in force on the pair by others plus leases that others hold, as of this statement."""
+    labels = select(Label.id).where(
+        Label.pair_id == pair_id, Label.annotator_id != annotator_id, is_effective()
+    )
+    leases = select(Lease.id).where(
+        Lease.pair_id == pair_id, Lease.annotator_id != annotator_id, _is_live(now)
+    )
+    both = union_all(labels, leases).subquery()
+    return session.execute(select(func.count()).select_from(both)).scalar_one()
 
 
 def count_by_state(session: Session, campaign_id: int) -> dict[PairState, int]:

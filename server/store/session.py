@@ -23,6 +23,9 @@ from server.states import JobKind
 
 logger = logging.getLogger(__name__)
 
+# Row lock for `with_for_update`: keeps other writers of the row away, but not inserts of rows that
+# refer to it (FOR NO KEY UPDATE on PostgreSQL; SQLite has one writer at a time anyway).
+LOCK = {"key_share": True}
 JOBS_TO_SEND = "jobs_to_send"  # key of Session.info: list[tuple[int, JobKind]]
 _BUSY_TIMEOUT_MS = 15_000  # how long a SQLite writer waits for the one before it
 

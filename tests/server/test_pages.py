@@ -40,6 +40,8 @@ def test_pages_render_under_a_policy_that_allows_no_foreign_or_inline_script(
     policy = answer.headers["content-security-policy"]
     assert policy.startswith("default-src 'self'") and "script-src" not in policy
     assert "unsafe-eval" not in policy
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["referrer-policy"] == "same-origin"
     inline = re.findall(r"<script(?![^>]*\bsrc=)(?![^>]*application/json)[^>]*>", answer.text)
     assert inline == []
     assert re.findall(r"(?:src|href)=\"(?:https?:)?//", answer.text) == []

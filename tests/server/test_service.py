@@ -198,7 +198,7 @@ def _try_at_random(world: World, operation: APIOperation) -> None:
 
     @given(case=operation.as_strategy())
     @settings(
-        max_examples=5,
+        max_examples=3,
         deadline=None,
         derandomize=True,
         database=None,
