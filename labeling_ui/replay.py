@@ -81,7 +81,8 @@ def make_replay(task: Task, left: Trajectory, right: Trajectory) -> bytes:
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
-            return _record(server, task, sides)
+            with server.atomic():  # nobody listens: do not wake the network thread per message
+                return _record(server, task, sides)
         finally:
             server.stop()
 

@@ -26,6 +26,7 @@ GAP = 6  # px between the sides
 FRAMES = 18  # moving frames; one more is held at the end
 FRAME_MS = 110
 HOLD_MS = 1400
+TIP = 5  # px, radius of the dot that moves
 DETAIL = 3  # drawn this many times larger, then scaled down for smooth edges
 
 INK = (38, 45, 56)
@@ -60,7 +61,8 @@ def make_thumbnail(task: Task, left: Trajectory, right: Trajectory) -> bytes:
     longest = max(len(left.paths), len(right.paths))
     ends = np.unique(np.linspace(1, longest, FRAMES).astype(int))
     shapes = task.scene_shapes()
-    frames = [_frame(shapes, left, right, int(end)) for end in ends]
+    panels = (_Panel("A", shapes, left), _Panel("B", shapes, right))
+    frames = [_frame(panels, int(end)) for end in ends]
     durations = [FRAME_MS] * (len(frames) - 1) + [HOLD_MS]
     buffer = io.BytesIO()
     imageio.imwrite(
@@ -76,41 +78,46 @@ def make_thumbnail(task: Task, left: Trajectory, right: Trajectory) -> bytes:
     return buffer.getvalue()
 
 
-def _frame(
-    shapes: Sequence[Mapping[str, Any]], left: Trajectory, right: Trajectory, end: int
-) -> NDArray[np.uint8]:
+class _Panel:
+    """One side: what does not move is drawn once, the path on a copy of it for every frame."""
+
+    def __init__(
+        self, name: str, shapes: Sequence[Mapping[str, Any]], trajectory: Trajectory
+    ) -> None:
+        self._colour = SIDE_COLOURS[name]
+        self._hit = trajectory.outcome.get("reason") == COLLISION
+        place = _fit(shapes)
+        self._path = [place.point(float(x), float(y)) for x, y in trajectory.paths[:, :2]]
+        size = (PANEL[0] * DETAIL, (PANEL[1] + HEADER) * DETAIL)
+        self._still = Image.new("RGB", size, (255, 255, 255))
+        draw = ImageDraw.Draw(self._still)
+        for shape in sorted(shapes, key=lambda shape: shape["type"] != "workspace"):
+            _draw_shape(draw, place, shape)
+        draw.line(self._path, fill=_pale(self._colour), width=DETAIL, joint="curve")
+        draw.rectangle((0, 0, size[0], (HEADER - 2) * DETAIL), fill=self._colour)
+        font = ImageFont.load_default(size=15 * DETAIL)
+        centre = (size[0] / 2, (HEADER - 2) * DETAIL / 2)
+        draw.text(centre, name, fill=(255, 255, 255), font=font, anchor="mm")
+
+    def picture(self, end: int) -> Image.Image:
+        """The path up to row `end`, and where it stands."""
+        large = self._still.copy()
+        draw = ImageDraw.Draw(large)
+        done = self._path[:end]
+        if len(done) > 1:
+            draw.line(done, fill=self._colour, width=3 * DETAIL, joint="curve")
+        (x, y), r = done[-1], TIP * DETAIL
+        tip = HIT_COLOUR if self._hit and end >= len(self._path) else INK
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=tip, outline=INK, width=DETAIL)
+        return large.reduce(DETAIL)
+
+
+def _frame(panels: tuple[_Panel, _Panel], end: int) -> NDArray[np.uint8]:
     """(208, 286, 3) uint8: both paths up to row `end`."""
-    width, height = 2 * PANEL[0] + GAP, PANEL[1] + HEADER
-    picture = Image.new("RGB", (width, height), PAPER)
-    for name, trajectory, x in (("A", left, 0), ("B", right, PANEL[0] + GAP)):
-        picture.paste(_panel(name, shapes, trajectory, end), (x, 0))
+    picture = Image.new("RGB", (2 * PANEL[0] + GAP, PANEL[1] + HEADER), PAPER)
+    for panel, x in zip(panels, (0, PANEL[0] + GAP), strict=True):
+        picture.paste(panel.picture(end), (x, 0))
     return np.asarray(picture)
-
-
-def _panel(
-    name: str, shapes: Sequence[Mapping[str, Any]], trajectory: Trajectory, end: int
-) -> Image.Image:
-    size = (PANEL[0] * DETAIL, (PANEL[1] + HEADER) * DETAIL)
-    panel = Image.new("RGB", size, (255, 255, 255))
-    draw = ImageDraw.Draw(panel)
-    place = _fit(shapes)
-    colour = SIDE_COLOURS[name]
-    for shape in sorted(shapes, key=lambda shape: shape["type"] != "workspace"):
-        _draw_shape(draw, place, shape)
-    path = [place.point(float(x), float(y)) for x, y in trajectory.paths[:, :2]]
-    draw.line(path, fill=_pale(colour), width=DETAIL, joint="curve")
-    done = path[:end]
-    if len(done) > 1:
-        draw.line(done, fill=colour, width=3 * DETAIL, joint="curve")
-    x, y = (float(value) for value in trajectory.paths[min(end, len(path)) - 1, :2])
-    stopped = end >= len(path) and trajectory.outcome.get("reason") == COLLISION
-    tip = HIT_COLOUR if stopped else INK
-    draw.ellipse(place.disc(x, y, 0.016), fill=tip, outline=INK, width=DETAIL)
-    draw.rectangle((0, 0, size[0], (HEADER - 2) * DETAIL), fill=colour)
-    font = ImageFont.load_default(size=15 * DETAIL)
-    centre = (size[0] / 2, (HEADER - 2) * DETAIL / 2)
-    draw.text(centre, name, fill=(255, 255, 255), font=font, anchor="mm")
-    return panel.resize((PANEL[0], PANEL[1] + HEADER), Image.Resampling.LANCZOS)
 
 
 def _fit(shapes: Sequence[Mapping[str, Any]]) -> _Map:
