@@ -16,7 +16,8 @@ from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from server.checkpoints import pretrained_by_task, task_facts
 from server.errors import ConflictError, NotFoundError
 from server.publications import record_start
-from server.rounds import EVALUATION_SEED, new_labels_since_round
+from server.rounds import EVALUATION_SEED
+from server.snapshots import new_labels_since_round
 from server.states import Choice, JobKind, JobState, PairState
 from server.store import jobs
 from server.store.events import audit

@@ -6,9 +6,6 @@ any state before the last three → failed | cancelled; a failed one can be take
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
@@ -19,8 +16,8 @@ from sqlalchemy.orm import Session
 from rodif_core.spec import FinetuneConfig
 from server.errors import ConflictError, NotFoundError
 from server.finetune_config import complete_config
+from server.snapshots import new_labels_since_round, snapshot_to_learn_from
 from server.states import (
-    Choice,
     JobKind,
     JobState,
     PairState,
@@ -30,9 +27,8 @@ from server.states import (
 )
 from server.store import jobs
 from server.store.events import add_event, audit
-from server.store.labels import effective_label_ids, snapshot_labels
 from server.store.session import LOCK
-from server.store.tables import Campaign, Job, LabelSnapshot, Pair, Round
+from server.store.tables import Campaign, Job, Pair, Round
 
 FINAL_STATES = frozenset(
     {
@@ -72,32 +68,6 @@ class RoundRequest:
     seed: int | None = None  # of the fine-tuning
 
 
-def freeze_snapshot(session: Session, now: datetime, campaign_id: int) -> LabelSnapshot:
-    """Freeze the labels that hold now; equal sets share one row. May be empty."""
-    label_ids = effective_label_ids(session, campaign_id)
-    digest = snapshot_digest(campaign_id, label_ids)
-    snapshot = session.get(LabelSnapshot, digest)
-    if snapshot is None:
-        snapshot = LabelSnapshot(
-            digest=digest,
-            campaign_id=campaign_id,
-            label_ids=label_ids,
-            size=len(label_ids),
-            created_at=now,
-        )
-        session.add(snapshot)
-        session.flush()
-    return snapshot
-
-
-def snapshot_digest(campaign_id: int, label_ids: Sequence[int]) -> str:
-    """SHA-256 of the canonical JSON of campaign and ordered label ids."""
-    content = {"campaign_id": campaign_id, "label_ids": list(label_ids)}
-    return hashlib.sha256(
-        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
-
-
 def launch(
     session: Session,
     now: datetime,
@@ -113,9 +83,7 @@ def launch(
     round of the campaign may still publish; UnknownNameError or ValueOutOfRangeError for a wrong
     configuration.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
+    campaign = _locked(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     settings = campaign.settings
@@ -123,7 +91,7 @@ def launch(
     config = _config(request, method=settings["method"])
     if publish_rule != PublishRule.NEVER:
         _refuse_second_publishing_round(session, campaign_id)
-    snapshot = _snapshot(session, now, campaign_id, request.snapshot_digest)
+    snapshot = snapshot_to_learn_from(session, now, campaign_id, request.snapshot_digest)
     evaluation = {"episodes": settings["evaluation_episodes"], "seed": EVALUATION_SEED}
     new_round = Round(
         campaign_id=campaign_id,
@@ -138,26 +106,37 @@ def launch(
     )
     session.add(new_round)
     session.flush()
+    _queue(session, now, new_round)
+    return new_round
+
+
+def _locked(session: Session, campaign_id: int) -> Campaign:
+    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
+    if campaign is None:
+        raise NotFoundError("campaign", campaign_id)
+    return campaign
+
+
+def _queue(session: Session, now: datetime, new_round: Round) -> None:
     jobs.enqueue(
         session,
         now,
         kind=JobKind.FINETUNE,
-        campaign_id=campaign_id,
+        campaign_id=new_round.campaign_id,
         round_id=new_round.id,
         payload={},
         dedupe_key=f"finetune:{new_round.id}",
-        created_by=started_by,
+        created_by=new_round.started_by,
     )
     _tell(session, now, new_round)
     audit(
         session,
         now,
-        actor_id=started_by,
+        actor_id=new_round.started_by,
         action="round.launch",
         subject=f"round/{new_round.id}",
-        details={"trigger": trigger, "snapshot_digest": snapshot.digest},
+        details={"trigger": new_round.trigger, "snapshot_digest": new_round.snapshot_digest},
     )
-    return new_round
 
 
 def _config(request: RoundRequest, *, method: str) -> FinetuneConfig:
@@ -182,25 +161,6 @@ def _publishing(campaign_id: int) -> Any:
         Round.publish_rule != PublishRule.NEVER,
         Round.state.not_in(FINAL_STATES),
     )
-
-
-def _snapshot(
-    session: Session, now: datetime, campaign_id: int, digest: str | None
-) -> LabelSnapshot:
-    if digest is None:
-        snapshot = freeze_snapshot(session, now, campaign_id)
-    else:
-        found = session.get(LabelSnapshot, digest)
-        if found is None or found.campaign_id != campaign_id:
-            raise NotFoundError(f"label snapshot of campaign {campaign_id}", digest)
-        snapshot = found
-    usable = {Choice.FIRST, Choice.SECOND}
-    if not any(row.choice in usable for row in snapshot_labels(session, snapshot.digest)):
-        raise ConflictError(
-            f"campaign {campaign_id} has {snapshot.size} labels in force, but none says which"
-            " episode is better; collect labels first"
-        )
-    return snapshot
 
 
 def move(
@@ -279,21 +239,6 @@ def retry_job(session: Session, now: datetime, job_id: int, *, by: int | None) -
     return job
 
 
-def new_labels_since_round(session: Session, campaign_id: int) -> int:
-    """Labels in force that no earlier publishing round has learned from."""
-    used: set[int] = set()
-    snapshots = (
-        select(LabelSnapshot.label_ids)
-        .join(Round, Round.snapshot_digest == LabelSnapshot.digest)
-        .where(Round.campaign_id == campaign_id, Round.publish_rule != PublishRule.NEVER)
-        .order_by(Round.id.desc())
-        .limit(1)
-    )
-    for label_ids in session.scalars(snapshots):
-        used.update(label_ids)
-    return sum(label_id not in used for label_id in effective_label_ids(session, campaign_id))
-
-
 def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger | None:
     """Why a round of this campaign should start now, by its settings; None when it should not."""
     every_labels = int(campaign.settings["round_after_labels"])
@@ -318,9 +263,7 @@ def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger 
 
 def launch_due(session: Session, now: datetime, campaign_id: int) -> Round | None:
     """Start the round that is due, if one is; two ticks at once start one round."""
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
+    campaign = _locked(session, campaign_id)
     trigger = is_due(session, now, campaign)
     if trigger is None:
         return None

@@ -13,6 +13,7 @@ from sqlalchemy import select
 from server import rounds
 from server.errors import ConflictError, NotFoundError
 from server.rounds import RoundRequest
+from server.snapshots import freeze_snapshot
 from server.states import (
     Choice,
     JobKind,
@@ -79,7 +80,7 @@ def test_a_snapshot_holds_the_last_word_of_each_annotator_on_each_pair(database:
         again = factories.add_label(session, pairs[1], ann, supersedes_id=undo.id, key="again")
         lone = factories.add_label(session, pairs[2], bob)
         factories.add_label(session, pairs[2], bob, supersedes_id=lone.id, retracted=True)
-        snapshot = rounds.freeze_snapshot(session, NOW, campaign.id)
+        snapshot = freeze_snapshot(session, NOW, campaign.id)
         expected = [edit.id, other.id, again.id]
         assert snapshot.label_ids == expected and snapshot.size == 3
         held = snapshot_labels(session, snapshot.digest)
@@ -94,13 +95,13 @@ def test_a_snapshot_is_the_same_until_a_label_comes_and_never_changes(database: 
         pairs = factories.add_pairs(session, campaign, 2)
         ann = factories.add_me(session, "ann").id
         label = factories.add_label(session, pairs[0], ann)
-        first = rounds.freeze_snapshot(session, NOW, campaign.id).digest
+        first = freeze_snapshot(session, NOW, campaign.id).digest
     with database.write() as session:
         later = NOW + timedelta(days=1)
-        assert rounds.freeze_snapshot(session, later, campaign.id).digest == first
+        assert freeze_snapshot(session, later, campaign.id).digest == first
         factories.add_label(session, pairs[0], ann, supersedes_id=label.id, retracted=True)
         factories.add_label(session, pairs[1], ann)
-        second = rounds.freeze_snapshot(session, later, campaign.id)
+        second = freeze_snapshot(session, later, campaign.id)
         assert second.digest != first
         assert [row.id for row in snapshot_labels(session, first)] == [label.id]
         with pytest.raises(NotFoundError, match="no label snapshot 'zzz'"):
