@@ -8,19 +8,21 @@ import signal
 import subprocess
 import sys
 import time
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import httpx2
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 UV = Path(sys.executable).with_name("uv")
 READY_SECONDS = 120.0
 STOP_SECONDS = 30.0
-# Read from the environment of whoever runs the tests, these would reach back into the source tree.
-NOT_INHERITED = ("PYTHONPATH", "VIRTUAL_ENV", "RODIF_STATE_DIR", "PYTEST_CURRENT_TEST")
+PASSWORD = "correct horse battery"
+# The first three would reach back into the source tree; without byte code every process compiles
+# torch anew.
+NOT_INHERITED = ("PYTHONPATH", "VIRTUAL_ENV", "RODIF_STATE_DIR", "PYTHONDONTWRITEBYTECODE")
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -57,7 +59,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def running(binaries: Path, state: Path) -> Iterator[str]:
     """`rodif up` until the block ends; its address."""
     command = [binaries / "rodif", "up", "--state", state, "--port", "0", "--workers", "1"]
-    env = environment() | {"PYTHONUNBUFFERED": "1"}
+    env = environment() | {"PYTHONUNBUFFERED": "1", "RODIF_ADMIN_PASSWORD": PASSWORD}
     log = state.with_suffix(".log")
     with log.open("wb") as output:
         process = subprocess.Popen(
@@ -81,15 +83,19 @@ def running(binaries: Path, state: Path) -> Iterator[str]:
 
 def test_every_process_starts_and_all_pages_are_in_the_wheel(installed: Path, tmp_path: Path):
     # Ready means: database at head, broker, worker and beat have given signs of life.
-    with running(installed, tmp_path / "state") as url:
-        for path in ("/sign-in", "/replay-client/", "/vendor/plotly.min.js"):
-            with urllib.request.urlopen(url + path, timeout=10) as answer:
-                assert answer.status == 200 and len(answer.read()) > 500, path
-        site = ROOT / "labeling_ui" / "site"
-        for file in sorted((site / "static").rglob("*.*")):
-            static = f"{url}/static/{file.relative_to(site / 'static')}"
-            with urllib.request.urlopen(static, timeout=10) as answer:
-                assert answer.read() == file.read_bytes(), static
+    with (
+        running(installed, tmp_path / "state") as url,
+        httpx2.Client(base_url=url, headers={"Origin": url}) as browser,
+    ):
+        account = {"name": "admin", "password": PASSWORD}
+        assert browser.post("/api/v1/session", json=account).status_code == 200
+        for path in ("/sign-in", "/admin", "/replay-client/", "/vendor/plotly.min.js"):
+            answer = browser.get(path)
+            assert answer.status_code == 200 and len(answer.content) > 500, path
+        folder = ROOT / "labeling_ui" / "site" / "static"
+        for file in sorted(folder.rglob("*.*")):
+            answer = browser.get(f"/static/{file.relative_to(folder)}")
+            assert answer.content == file.read_bytes(), file
 
 
 def test_doctor_finds_all_that_running_needs(installed: Path, tmp_path: Path):
