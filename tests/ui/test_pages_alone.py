@@ -1,0 +1,87 @@
+"""The pages live on their own server: nothing comes from elsewhere, and nothing goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from playwright.sync_api import ConsoleMessage, Page
+
+from tests.ui.driving import LabelPage, take_session, until
+from tests.ui.studio import Studio
+
+pytestmark = pytest.mark.browser
+
+# viser's client, which is not ours, warns and tries `eval` for a feature that replays do not use.
+KNOWN = ("THREE.Clock", "GL Driver Message", "Violates", "violates", "Detected chrome", "WebGL")
+
+
+class Witness:
+    """Notes foreign addresses, errors and warnings of a page."""
+
+    def __init__(self, page: Page, studio: Studio) -> None:
+        self.foreign: list[str] = []
+        self.complaints: list[str] = []
+        allowed = (studio.url, "blob:", "data:")
+        page.on(
+            "request",
+            lambda request: (
+                None if request.url.startswith(allowed) else self.foreign.append(request.url)
+            ),
+        )
+        page.on("console", self._note)
+        page.on("pageerror", lambda error: self._note_text(str(error)))
+
+    def _note(self, message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning"):
+            self._note_text(message.text)
+
+    def _note_text(self, text: str) -> None:
+        if not any(known in text for known in KNOWN):
+            self.complaints.append(text)
+
+
+def test_annotators_page_loads_from_its_own_server_only(
+    studio: Studio, page: Page, label_page: Callable[[int], LabelPage]
+) -> None:
+    witness = Witness(page, studio)
+    driver = label_page(studio.add_campaign([True]))
+    driver.wait_state("state.t > 0")
+    assert witness.foreign == []
+    assert witness.complaints == []
+
+
+@pytest.mark.parametrize("path", ["/sign-in", "/label", "/admin", "/admin/campaigns/{id}"])
+def test_other_pages_load_from_their_own_server_only(studio: Studio, page: Page, path: str) -> None:
+    campaign = studio.add_campaign([True])
+    studio.add_campaign()  # a second one: the choice of campaigns stays on the screen
+    witness = Witness(page, studio)
+    if path != "/sign-in":
+        take_session(page, studio, "admin")
+    page.goto(studio.url + path.format(id=campaign))
+    until(page, "!document.body.innerText.includes('Loading…')")
+    page.wait_for_timeout(500)
+    assert page.locator("h1, .brand").first.is_visible()
+    assert witness.foreign == []
+    assert witness.complaints == []
+
+
+@pytest.mark.parametrize("path", ["/sign-in", "/label", "/admin", "/admin/campaigns/{id}"])
+def test_pages_fit_a_phone_and_every_control_has_a_name(
+    studio: Studio, page: Page, path: str
+) -> None:
+    campaign = studio.add_campaign([True])
+    page.set_viewport_size({"width": 390, "height": 844})
+    if path != "/sign-in":
+        take_session(page, studio, "admin")
+    page.goto(studio.url + path.format(id=campaign))
+    until(page, "!document.body.innerText.includes('Loading…')")
+    page.wait_for_timeout(500)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    nameless = page.evaluate(
+        """() => [...document.querySelectorAll("button, a, input, select, summary")]
+          .filter((item) => item.checkVisibility())
+          .filter((item) => !(item.innerText || item.ariaLabel || item.labels?.length))
+          .map((item) => item.outerHTML)"""
+    )
+    assert nameless == []
