@@ -178,7 +178,8 @@ def score(
 
 
 def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
-    """The scale whose rollouts the labels like best, among those that keep success and support.
+    """The scale whose rollouts the labels like best, less what leaves the data, among those that
+    keep success and support.
 
     When none keeps both, the one that leaves the data least. Ties go to the smaller scale.
     """
@@ -189,7 +190,7 @@ def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
         if trial.success >= base.success - SUCCESS_SLACK and trial.off_support <= limit
     ]
     if sound:
-        return max(sound, key=lambda trial: (trial.predicted, -trial.scale))
+        return max(sound, key=lambda trial: (trial.predicted - trial.off_support, -trial.scale))
     return min(trials, key=lambda trial: (trial.off_support - trial.success, trial.scale))
 
 

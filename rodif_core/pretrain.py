@@ -38,7 +38,7 @@ class PretrainConfig:
     """How a policy is pretrained. Two presets: `cpu` (minutes on 2 cores) and `paper` (a GPU)."""
 
     channels: tuple[int, ...] = (16, 32, 64)
-    updates: int = 12_000
+    updates: int = 10_000
     batch_size: int = 128
     learning_rate: float = 1e-3
     weight_decay: float = 1e-6

@@ -91,10 +91,10 @@ def _rollout_batch(checkpoint: Checkpoint, task: Task, seeds: list[int]) -> list
             _decide(policy, records, generators, active, chunks)
         actions = np.clip(chunks[:, offset], -task.action_limit, task.action_limit)
         observations = env.step(actions)
-        qpos, paths = env.qpos, env.paths
+        qpos, paths, steps_done = env.qpos, env.paths, env.steps
         for i in active:
             # A step in which the physics diverged never happened: its state is not finite.
-            if env.steps[i] > step:
+            if steps_done[i] > step:
                 records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i])
         step += 1
     outcomes = env.outcomes()
@@ -137,7 +137,7 @@ def _finish(
 ) -> Trajectory:
     return Trajectory(
         observations=np.stack(record.observations),
-        actions=np.stack(record.actions),
+        actions=np.array(record.actions, dtype=np.float32).reshape(-1, task.action_dim),
         qpos=np.stack(record.qpos),
         paths=np.stack(record.paths),
         histories=np.stack(record.histories),

@@ -95,9 +95,9 @@ class _JsonConfig:
 class GuideConfig(_JsonConfig):
     """Second half of `rodif_guided`: how the kept trajectories move the policy."""
 
-    scorer: Scorer = Scorer.COMBINED
-    score_updates: int = 12  # full-batch RoDiF updates of the throw-away copy
-    scales: tuple[float, ...] = (1.0, 2.0, 3.0)  # guidance scales tried, the gate picks one
+    scorer: Scorer = Scorer.GAUSSIAN_PROCESS
+    score_updates: int = 6  # full-batch RoDiF updates of the throw-away copy
+    scales: tuple[float, ...] = (2.0, 3.0)  # guidance scales tried, the gate picks one
     updates: int = 200
     learning_rate: float = 1e-4
     batch_size: int = 256
@@ -160,7 +160,7 @@ class FinetuneConfig(_JsonConfig):
     matched_state_scale: float = 0.15  # length scale, normalised observation units
     executed_only: bool = False  # log-ratio over the executed part of the chunk only
     learning_rate: float = 3e-5
-    updates: int = 30  # full-batch updates of `rodif` and `dp_dpo`
+    updates: int = 12  # full-batch updates of `rodif` and `dp_dpo`
     chunk_rows: int = 1024  # network rows per forward pass; memory only, not the result
     seed: int = 0
     guide: GuideConfig = field(default_factory=GuideConfig)

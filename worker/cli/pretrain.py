@@ -18,7 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("task", choices=list(TaskName))
     parser.add_argument("--out", type=Path, required=True, help="checkpoint file to write")
     parser.add_argument("--preset", choices=PRESET_NAMES, default="cpu")
-    parser.add_argument("--demonstrations", type=int, default=800)
+    parser.add_argument("--demonstrations", type=int, default=2000)
     parser.add_argument(
         "--left-share", type=float, help="share of demonstrations on the left (default: the task's)"
     )
