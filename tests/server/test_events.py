@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
+from pathlib import Path
 
 import httpx2
 import pytest
@@ -15,8 +16,9 @@ from server.store.events import add_event
 from server.store.tables import Pair
 from tests import factories
 from tests.factories import NOW
+from tests.server.postgres import PostgresMaker
 from tests.server.serving import Message, read_events, serving
-from tests.server.world import World
+from tests.server.world import World, make_world
 
 
 @pytest.fixture
@@ -130,6 +132,32 @@ def test_long_histories_come_complete(world: World, address: str, round_id: int)
     ):
         messages = list(read_events(response))
     assert [m.data["step"] for m in messages if m.event == "curve"] == list(range(450))
+
+
+def test_an_event_that_is_committed_late_is_not_missed(
+    postgres: PostgresMaker, postgres_migrated: str, tmp_path: Path
+) -> None:
+    """On PostgreSQL a smaller id can become visible after a larger one."""
+    postgres.empty(postgres_migrated)
+    with make_world(postgres.address(postgres_migrated), tmp_path) as world:
+        world.add_campaign()
+        slow = world.database.write()
+        session = slow.__enter__()
+        add_event(session, NOW, campaign_id=1, kind="job", data={"id": "small"})
+        session.flush()
+        with world.database.write() as fast:
+            add_event(fast, NOW, campaign_id=1, kind="job", data={"id": "large"})
+        with (
+            serving(world.app) as url,
+            _stream(world, f"{url}/api/v1") as client,
+            client.stream("GET", "/campaigns/1/events") as response,
+        ):
+            messages = read_events(response)
+            first = next(messages)
+            slow.__exit__(None, None, None)
+            second = next(messages)
+    assert [first.data["id"], second.data["id"]] == ["large", "small"]
+    assert second.id == first.id  # to resume after the larger one
 
 
 def test_unknown_rounds_and_annotators_get_an_answer_and_no_stream(

@@ -94,6 +94,12 @@ def test_prefetching_gives_the_next_pair_and_keeps_both_leases(world: World) -> 
     assert follow["progress"] == {"done": 1, "remaining": 2}
 
 
+def test_holding_two_pairs_gives_a_second_one_and_then_the_first_again(world: World) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=3)
+    given = [_next(world, "ann", campaign_id, hold=2)["pair"]["id"] for _ in range(3)]
+    assert given == [pair_ids[0], pair_ids[1], pair_ids[0]]
+
+
 def test_prefetching_at_the_end_finds_nothing_but_a_reload_still_shows_the_last_pair(
     world: World,
 ) -> None:
