@@ -87,9 +87,10 @@ def test_every_process_starts_and_all_pages_are_in_the_wheel(installed: Path, tm
         running(installed, tmp_path / "state") as url,
         httpx2.Client(base_url=url, headers={"Origin": url}) as browser,
     ):
+        assert "password" in browser.get("/sign-in").text
         account = {"name": "admin", "password": PASSWORD}
         assert browser.post("/api/v1/session", json=account).status_code == 200
-        for path in ("/sign-in", "/admin", "/replay-client/", "/vendor/plotly.min.js"):
+        for path in ("/admin", "/replay-client/", "/vendor/plotly.min.js"):
             answer = browser.get(path)
             assert answer.status_code == 200 and len(answer.content) > 500, path
         folder = ROOT / "labeling_ui" / "site" / "static"
