@@ -64,7 +64,7 @@ def running_site(state: Path, **settings: Any) -> Iterator[Site]:
         "resend_seconds": 0.5,
     }
     given = Settings(_env_file=None, **(chosen | settings))
-    with running_system(given, workers=1, admin_password=PASSWORD) as system:
+    with running_system(given, workers=1, admin_password=PASSWORD, ready_seconds=180) as system:
         database = Database(system.settings.database_url)
         try:
             with Client(system.url) as api:
@@ -84,7 +84,7 @@ def kill_tree(pid: int) -> None:
     psutil.wait_procs(family[1:], timeout=10)
 
 
-def wait_for(condition: Callable[[], bool], what: str, seconds: float = 90.0) -> None:
+def wait_for(condition: Callable[[], bool], what: str, seconds: float = 180.0) -> None:
     """Poll until the condition holds."""
     deadline = time.monotonic() + seconds
     while not condition():

@@ -39,7 +39,7 @@ def test_collect_completes_without_duplicates_when_the_worker_is_killed(site: Si
     (job,) = site.rows(Job, id=job_id)
     assert (job.state, job.attempt) == (JobState.RUNNING, 1), "killed too late for this test"
 
-    site.api.wait_for_job(job_id, seconds=90)
+    site.api.wait_for_job(job_id, seconds=180)
     (job,) = site.rows(Job, id=job_id)
     assert job.attempt >= 2
     seeds = Counter(episode.seed for episode in site.rows(Episode))
@@ -61,7 +61,7 @@ def test_work_goes_on_when_the_broker_is_killed(site: Site) -> None:
     kill_tree(site.system.pid("broker"))
     second = site.post("/collect", collect)["id"]  # the row is stored whatever the broker does
     for job_id in (first, second):
-        site.api.wait_for_job(job_id, seconds=90)
+        site.api.wait_for_job(job_id, seconds=180)
     seeds = Counter(episode.seed for episode in site.rows(Episode))
     assert seeds == Counter(range(before + 50))
     wait_for(lambda: site.system.not_ready() is None, "all parts are ready again")
@@ -82,7 +82,7 @@ def test_finetune_completes_with_one_checkpoint_when_the_worker_is_killed(site: 
     (job,) = site.rows(Job, round_id=round_id, kind=JobKind.FINETUNE)
     assert (job.state, job.attempt) == (JobState.RUNNING, 1), "killed too late for this test"
 
-    ended = site.api.wait_for_round(round_id, seconds=120)
+    ended = site.api.wait_for_round(round_id, seconds=180)
     assert ended["state"] == RoundState.KEPT
     (job,) = site.rows(Job, round_id=round_id, kind=JobKind.FINETUNE)
     assert job.attempt >= 2
@@ -96,6 +96,6 @@ def test_finetune_completes_with_one_checkpoint_when_the_worker_is_killed(site: 
 
     # The same round again, undisturbed: the killed one came to the same weights.
     again = site.post("/rounds", body | {"snapshot_digest": ended["snapshot_digest"]})["id"]
-    site.api.wait_for_round(again, seconds=120)
+    site.api.wait_for_round(again, seconds=180)
     (calm,) = site.rows(Checkpoint, round_id=again)
     assert calm.digest == candidate.digest

@@ -137,7 +137,7 @@ def site(postgres_url: str, tmp_path: Path) -> Iterator[Site]:
 
 def test_collect_label_and_round_pass_through_the_split(site: Site) -> None:
     collect = {"episodes": EPISODES, "pairs": PAIRS, "strategy": "random"}
-    job = site.api.wait_for_job(site.post("/collect", collect)["id"], seconds=120)
+    job = site.api.wait_for_job(site.post("/collect", collect)["id"], seconds=180)
     assert (job["result"]["episodes"], job["result"]["pairs"]) == (EPISODES, PAIRS)
     assert len(site.rows(Episode)) == EPISODES
     wait_for(
@@ -150,7 +150,7 @@ def test_collect_label_and_round_pass_through_the_split(site: Site) -> None:
         "evaluation": {"episodes": 10},
     }
     round_id = site.post("/rounds", body)["id"]
-    ended = site.api.wait_for_round(round_id, seconds=120)
+    ended = site.api.wait_for_round(round_id, seconds=180)
     # Three tiny updates keep the policy what it was, so the gate lets it pass.
     assert ended["state"] == RoundState.PUBLISHED
     (candidate,) = site.rows(Checkpoint, round_id=round_id)
