@@ -48,10 +48,23 @@ def test_every_environment_setting_is_documented_with_its_default():
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.__name__)
-def test_every_field_of_a_configuration_is_documented(config: type):
-    text = text_of("configuration.md")
+def test_every_field_of_a_configuration_is_documented_with_its_default(config: type):
+    sections = re.split(r"^## ", text_of("configuration.md"), flags=re.MULTILINE)
+    section = next(part for part in sections if part.startswith(f"{config.__name__}\n"))
     for field in dataclasses.fields(config):
-        assert f"| `{field.name}` |" in text, field.name
+        default = getattr(config(), field.name)
+        shown = "" if dataclasses.is_dataclass(default) else default_text(default)
+        assert f"| `{field.name}` | {shown}".rstrip() in section, (field.name, shown)
+
+
+def default_text(value: object) -> str:
+    if isinstance(value, StrEnum):
+        return f"`{value}` |"
+    if isinstance(value, tuple):
+        return ", ".join(f"{part:g}" for part in value) + " |"
+    if value is None or isinstance(value, bool):
+        return f"{'null' if value is None else str(value).lower()} |"
+    return f"{value:g} |"
 
 
 @pytest.mark.parametrize("config", [CampaignSettings, CollectSettings])
