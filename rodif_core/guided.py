@@ -37,6 +37,7 @@ from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 SELECTION_SEED = 7_000_000  # rollouts that choose a scale never share a seed with an evaluation
+IMITATION = 1.0  # guidance scale that only imitates
 SUCCESS_SLACK = 0.03  # a scale may lose this much success against the parent on the same seeds
 
 
@@ -77,6 +78,7 @@ class Trial:
     success: float
     off_support: float
     predicted: float  # share of rollouts that succeed and that the labels predict to be preferred
+    liked: tuple[Trajectory, ...]  # those rollouts
 
     def to_json(self) -> dict[str, float]:
         """Plain JSON types."""
@@ -104,28 +106,32 @@ def finetune_guided(
         checkpoint, trajectories, preferences, transitions, matrix, config, workspace, progress
     )
     histories, chunks = _kept_decisions(transitions, scores.kept)
-    base = _try(checkpoint, checkpoint.policy, 0.0, scores, config, 0)
-    trials = []
-    for index, scale in enumerate(config.guide.scales):
+    base = _try(checkpoint, checkpoint.policy, 0.0, scores, config)
+    trials: list[Trial] = []
+    for scale in config.guide.scales:
         policy = guide(
             checkpoint.policy, histories, chunks, scale, config.guide, config.seed,
             _stage(progress, f"guide s={scale:g}"),
         )  # fmt: skip
-        trials.append(_try(checkpoint, policy, scale, scores, config, 0))
-        if progress is not None:
-            metrics = {k: v for k, v in trials[-1].to_json().items() if k != "scale"}
-            progress("choose", (index + 1) / len(config.guide.scales), metrics)
+        trials.append(_try(checkpoint, policy, scale, scores, config))
+        _tell(progress, "choose", len(trials) / len(config.guide.scales), trials[-1])
     chosen = choose(base, trials)
-    report: dict[str, Any] = {
+    retrained: list[Trial] = []
+    for extra in range(config.guide.self_training_rounds):
+        fresh = _self_train(
+            checkpoint, chosen, [*trials, *retrained], scores, histories, chunks, config, extra,
+            progress,
+        )  # fmt: skip
+        retrained.append(fresh)
+        _tell(progress, "choose again", (extra + 1) / config.guide.self_training_rounds, fresh)
+        chosen = choose(base, [chosen, fresh])
+    report = {
         "scores": scores.to_json(),
         "base": base.to_json(),
         "trials": [trial.to_json() for trial in trials],
-        "chosen_scale": chosen.scale,
-        "self_training": [],
+        "self_training": [trial.to_json() for trial in retrained],
+        "chosen": chosen.to_json(),
     }
-    for extra in range(config.guide.self_training_rounds):
-        chosen = _self_train(checkpoint, chosen, scores, histories, chunks, config, extra, progress)
-        report["self_training"].append(chosen.to_json())
     return chosen.policy, report
 
 
@@ -205,32 +211,24 @@ def _try(
     scale: float,
     scores: Scores,
     config: FinetuneConfig,
-    block: int,
 ) -> Trial:
-    """Fresh rollouts of a policy; every trial of a block uses the same seeds."""
-    rollouts = _fresh(checkpoint, policy, config.guide.selection_rollouts, config, block)
-    liked = _liked(rollouts, scores)
+    """Fresh rollouts of a policy; all trials of a round use the same seeds."""
+    seed = SELECTION_SEED + 10_000 * config.seed
+    settings = RolloutConfig(config.guide.selection_rollouts, seed)
+    rollouts = rollout(replace(checkpoint, policy=policy), settings)
+    predicted = scores.path_utility.predict(PathFeatures.of(rollouts)) > scores.path_threshold
+    liked = tuple(
+        t for t, preferred in zip(rollouts, predicted, strict=True) if preferred and t.success
+    )
     off = off_support_share(rollouts, checkpoint.policy.normaliser, checkpoint.support)
     success = float(np.mean([trajectory.success for trajectory in rollouts]))
-    return Trial(scale, policy, success, off, float(liked.mean()))
-
-
-def _fresh(
-    checkpoint: Checkpoint, policy: DiffusionPolicy, count: int, config: FinetuneConfig, block: int
-) -> list[Trajectory]:
-    seed = SELECTION_SEED + 10_000 * config.seed + 1_000 * block
-    return rollout(replace(checkpoint, policy=policy), RolloutConfig(count, seed))
-
-
-def _liked(rollouts: Sequence[Trajectory], scores: Scores) -> NDArray[np.bool_]:
-    predicted = scores.path_utility.predict(PathFeatures.of(rollouts)) > scores.path_threshold
-    liked: NDArray[np.bool_] = predicted & np.asarray([t.success for t in rollouts])
-    return liked
+    return Trial(scale, policy, success, off, len(liked) / len(rollouts), liked)
 
 
 def _self_train(
     checkpoint: Checkpoint,
-    current: Trial,
+    chosen: Trial,
+    trials: Sequence[Trial],
     scores: Scores,
     histories: Tensor,
     chunks: Tensor,
@@ -238,19 +236,27 @@ def _self_train(
     extra: int,
     progress: Progress | None,
 ) -> Trial:
-    """Roll out, keep what succeeds and is predicted to be liked, guide again from the present."""
-    count = config.guide.self_training_rollouts
-    rollouts = _fresh(checkpoint, current.policy, count, config, 2 * extra + 1)
-    good = [t for t, ok in zip(rollouts, _liked(rollouts, scores), strict=True) if ok]
-    if good:
-        fresh = Transitions.collect(current.policy, good, config.chunk_rows)
-        histories = torch.cat([histories, fresh.histories])
-        chunks = torch.cat([chunks, fresh.chains[:, -1]])
+    """Imitate the winners and all liked rollouts of the trials, from the chosen policy on.
+
+    The rollouts exist already; what failed among them is what this pass forgets. Its scale is 1:
+    the policy is where it should go, and pushing on costs success.
+    """
+    liked = [trajectory for trial in trials for trajectory in trial.liked]
+    if liked:
+        more = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
+        histories = torch.cat([histories, more.histories])
+        chunks = torch.cat([chunks, more.chains[:, -1]])
     policy = guide(
-        current.policy, histories, chunks, current.scale, config.guide,
+        chosen.policy, histories, chunks, IMITATION, config.guide,
         config.seed + extra + 1, _stage(progress, f"self-training {extra + 1}"),
     )  # fmt: skip
-    return _try(checkpoint, policy, current.scale, scores, config, 2 * extra + 2)
+    return _try(checkpoint, policy, chosen.scale, scores, config)
+
+
+def _tell(progress: Progress | None, stage: str, fraction: float, trial: Trial) -> None:
+    if progress is not None:
+        facts = trial.to_json()
+        progress(stage, fraction, {name: facts[name] for name in facts if name != "scale"})
 
 
 def _stage(progress: Progress | None, name: str) -> Any:

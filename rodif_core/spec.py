@@ -96,16 +96,15 @@ class GuideConfig(_JsonConfig):
     """Second half of `rodif_guided`: how the kept trajectories move the policy."""
 
     scorer: Scorer = Scorer.GAUSSIAN_PROCESS
-    score_updates: int = 6  # full-batch RoDiF updates of the throw-away copy
-    scales: tuple[float, ...] = (2.0, 3.0)  # guidance scales tried, the gate picks one
+    score_updates: int = 4  # full-batch RoDiF updates of the throw-away copy
+    scales: tuple[float, ...] = (1.0, 2.0)  # guidance scales tried, the gate picks one
     updates: int = 200
     learning_rate: float = 1e-4
     batch_size: int = 256
     ema_decay: float = 0.98
     selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
     require_success: bool = True  # keep only trajectories that the simulation calls successful
-    self_training_rounds: int = 0  # extra guide passes on fresh rollouts, without new labels
-    self_training_rollouts: int = 150
+    self_training_rounds: int = 1  # more passes that add the liked ones of those rollouts
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scorer", parse_name(Scorer, self.scorer, "scorer"))
@@ -132,12 +131,6 @@ class GuideConfig(_JsonConfig):
             "self_training_rounds",
             self.self_training_rounds,
             "0 … 5",
-        )
-        _require(
-            self.self_training_rollouts >= 10,
-            "self_training_rollouts",
-            self.self_training_rollouts,
-            "at least 10",
         )
 
 

@@ -76,7 +76,6 @@ def test_finetune_value_out_of_range_is_named(field: str, value: float) -> None:
         ("ema_decay", 1.0),
         ("selection_rollouts", 1),
         ("self_training_rounds", 9),
-        ("self_training_rollouts", 1),
     ],
 )
 def test_guide_value_out_of_range_is_named(field: str, value: object) -> None:
