@@ -29,6 +29,14 @@ def _utc_now() -> datetime:
     return datetime.now(UTC)
 
 
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    services: Services = app.state.services
+    check_at_head(services.settings.database_url)
+    yield
+    services.database.dispose()
+
+
 def create_app(
     settings: Settings | None = None,
     send_job: SendJob | None = None,
@@ -42,16 +50,10 @@ def create_app(
     assert settings.artifact_dir is not None
     database = Database(settings.database_url, send_job or make_sender(settings.broker_url))
 
-    @asynccontextmanager
-    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        check_at_head(settings.database_url)
-        yield
-        database.dispose()
-
     app = FastAPI(
         title="RoDiF Studio",
         version=VERSION,
-        lifespan=lifespan,
+        lifespan=_lifespan,
         max_body_size=MAX_BODY_BYTES,
         openapi_url=f"{API_PREFIX}/openapi.json",
         docs_url=None,  # the usual pages load scripts from other hosts; docs/api.md stands in

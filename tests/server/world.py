@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
+from server.api.services import Services
 from server.app import create_app
 from server.settings import Settings
 from server.states import AnnotatorKind, JobKind, PairState, Role
+from server.store.artifacts import ArtifactStore
 from server.store.session import Database
 from tests import factories
 from tests.factories import Clock
@@ -79,12 +83,25 @@ class World:
             return campaign.id, [pair.id for pair in made]
 
 
+@cache
+def _app() -> FastAPI:
+    """The application, made once per process: building its routes takes longer than most tests.
+
+    All that it remembers lies in the services that each world gives it.
+    """
+    return create_app(Settings(state_dir=Path(tempfile.gettempdir())))
+
+
 @contextmanager
 def make_world(database_url: str, folder: Path) -> Iterator[World]:
     """Accounts: ada (admin), sam (service, simulated), ann and bob (annotators)."""
     settings = Settings(state_dir=folder, database_url=database_url, argon2_cheap=True)
-    clock, sent = Clock(), []
-    app = create_app(settings, lambda job_id, kind: sent.append((job_id, kind)), clock)
+    clock = Clock()
+    sent: list[tuple[int, JobKind]] = []
+    served = Database(database_url, lambda job_id, kind: sent.append((job_id, kind)))
+    artifacts = ArtifactStore(folder / "artifacts")
+    app = _app()
+    app.state.services = Services(settings, served, artifacts, clock)
     database = Database(database_url)
     made = World(app, settings, database, clock, sent)
     made.add_account("ada", Role.ADMIN)
@@ -92,5 +109,5 @@ def make_world(database_url: str, folder: Path) -> Iterator[World]:
     made.add_account("ann")
     made.add_account("bob")
     yield made
-    app.state.services.database.dispose()
+    served.dispose()
     database.dispose()
