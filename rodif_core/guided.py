@@ -38,6 +38,7 @@ from rodif_core.trajectory import Trajectory
 Array = NDArray[np.float64]
 SELECTION_SEED = 7_000_000  # rollouts that choose a scale never share a seed with an evaluation
 IMITATION = 1.0  # guidance scale that only imitates
+NOISE = 0.04  # of a rate near 1 over 100 rollouts: two standard errors
 SUCCESS_SLACK = 0.03  # a scale may lose this much success against the parent on the same seeds
 
 
@@ -124,7 +125,7 @@ def finetune_guided(
         )  # fmt: skip
         retrained.append(fresh)
         _tell(progress, "choose again", (extra + 1) / config.guide.self_training_rounds, fresh)
-        chosen = choose(base, [chosen, fresh])
+        chosen = fresh if improves(base, chosen, fresh) else chosen
     report = {
         "scores": scores.to_json(),
         "base": base.to_json(),
@@ -183,13 +184,23 @@ def score(
     )
 
 
+def improves(base: Trial, before: Trial, after: Trial) -> bool:
+    """Whether a self-training pass replaces what it started from.
+
+    It imitates successes and so is believed, unless its rollouts say clearly otherwise: it left
+    the data, or it is liked less by more than chance explains.
+    """
+    kept = after.predicted - after.off_support >= before.predicted - before.off_support - NOISE
+    return kept and after.off_support <= _off_support_limit(base)
+
+
 def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
     """The scale whose rollouts the labels like best, less what leaves the data, among those that
     keep success and support.
 
     When none keeps both, the one that leaves the data least. Ties go to the smaller scale.
     """
-    limit = OFF_SUPPORT_RATIO * base.off_support + OFF_SUPPORT_SLACK / 2
+    limit = _off_support_limit(base)
     sound = [
         trial
         for trial in trials
@@ -198,6 +209,11 @@ def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
     if sound:
         return max(sound, key=lambda trial: (trial.predicted - trial.off_support, -trial.scale))
     return min(trials, key=lambda trial: (trial.off_support - trial.success, trial.scale))
+
+
+def _off_support_limit(base: Trial) -> float:
+    # Half the gate's slack: the gate will look at other rollouts.
+    return OFF_SUPPORT_RATIO * base.off_support + OFF_SUPPORT_SLACK / 2
 
 
 def _kept_decisions(transitions: Transitions, kept: Sequence[int]) -> tuple[Tensor, Tensor]:

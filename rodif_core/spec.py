@@ -100,7 +100,7 @@ class GuideConfig(_JsonConfig):
     scales: tuple[float, ...] = (1.0, 2.0)  # guidance scales tried, the gate picks one
     updates: int = 200
     learning_rate: float = 1e-4
-    batch_size: int = 256
+    batch_size: int = 128
     ema_decay: float = 0.98
     selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
     require_success: bool = True  # keep only trajectories that the simulation calls successful

@@ -14,7 +14,7 @@ from rodif_core.diffusion.chain import add_noise
 from rodif_core.errors import LearningError
 from rodif_core.finetune import finetune
 from rodif_core.guidance import guidance_target, guide
-from rodif_core.guided import Trial, choose
+from rodif_core.guided import Trial, choose, improves
 from rodif_core.log_ratio import PairMatrix, Transitions
 from rodif_core.preferences.pairs import Preference
 from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
@@ -203,3 +203,10 @@ def test_choice_takes_the_least_harm_when_no_scale_is_sound() -> None:
     base = trial(0.0, 0.9, 0.02, 0.2)
     trials = [trial(1.0, 0.5, 0.3, 0.9), trial(2.0, 0.8, 0.1, 0.4)]
     assert choose(base, trials).scale == 2.0
+
+
+def test_self_training_is_believed_unless_it_is_clearly_worse() -> None:
+    base, before = trial(0.0, 0.9, 0.02, 0.2), trial(1.0, 0.95, 0.02, 0.95)
+    assert improves(base, before, trial(1.0, 0.94, 0.02, 0.94))
+    assert not improves(base, before, trial(1.0, 0.85, 0.02, 0.85))
+    assert not improves(base, before, trial(1.0, 0.99, 0.2, 0.99))
