@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import httpx2
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
@@ -61,10 +62,21 @@ def demo() -> Iterator[Site]:
                     break
             else:
                 raise SystemExit(f"rodif demo ended with {process.wait()} before the site was up")
-            yield Site(url, "admin", password)
+            site = Site(url, "admin", password)
+            leave_something_to_label(site)
+            yield site
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(timeout=60)
+
+
+def leave_something_to_label(site: Site) -> None:
+    """The demo's annotators may have judged every pair: ask for a second opinion on each."""
+    with httpx2.Client(base_url=f"{site.url}/api/v1", headers={"Origin": site.url}) as api:
+        api.post("/session", json={"name": site.name, "password": site.password})
+        for campaign in api.get("/campaigns").json():
+            change = {"settings": {"labels_per_pair": 2}}
+            api.patch(f"/campaigns/{campaign['id']}", json=change).raise_for_status()
 
 
 def save(page: Page, path: Path, *, full: bool = False) -> None:
@@ -163,12 +175,18 @@ def take_campaign(page: Page, site: Site, campaign: int, out: Path) -> None:
     page.locator(".tile").first.wait_for(timeout=READY_MS)
     page.wait_for_timeout(4000)  # charts and moving pictures
     save(page, out / "campaign.png")
+    page.mouse.move(640, 400)
+    for _ in range(8):  # pictures load when they come into view
+        page.mouse.wheel(0, 600)
+        page.wait_for_timeout(400)
     save(page, out / "campaign-whole.png", full=True)
+    page.mouse.wheel(0, -6000)
     page.get_by_role("button", name="Start round").click()
     page.wait_for_timeout(500)
     save(page, out / "start-round.png")
     page.keyboard.press("Escape")
-    page.locator("#checkpoints").get_by_role("button", name="Lineage").first.click()
+    published = page.locator("#checkpoints tr", has_text="published")
+    published.get_by_role("button", name="Lineage").click()
     page.get_by_role("dialog").wait_for()
     page.wait_for_timeout(500)
     save(page, out / "lineage.png")

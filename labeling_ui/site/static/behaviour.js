@@ -12,23 +12,26 @@ const MEASURES = [
 
 export function measures(before, after) {
   return MEASURES.map(({ key, name, better }) => {
-    const change = after ? after[key] - before[key] : null;
     return element(
       "div.measure", {},
       element(
         "div.measure-head", {}, element("h3", {}, name),
-        change === null ? null : changeText(change, better),
+        after ? changeText(before, after, key, better) : null,
       ),
       barRow("before", before, key), after ? barRow("after", after, key) : null,
     );
   });
 }
 
-function changeText(change, better) {
-  const points = Math.round(100 * change);
-  const direction = points * better > 0 ? "up" : points * better < 0 ? "down" : "";
+// Coloured only when the two 95 % intervals do not overlap: the rest may be chance.
+function changeText(before, after, key, better) {
+  const points = Math.round(100 * (after[key] - before[key]));
+  const [one, other] = [before.intervals?.[key], after.intervals?.[key]];
+  const clear = one && other && (one[1] < other[0] || other[1] < one[0]);
+  const look = !clear ? "" : points * better > 0 ? ".up" : ".down";
   const sign = points > 0 ? "+" : points < 0 ? "−" : "±";
-  return element(`span.change${direction ? `.${direction}` : ""}`, {}, `${sign}${Math.abs(points)} points`);
+  const noun = Math.abs(points) === 1 ? "point" : "points";
+  return element(`span.change${look}`, {}, `${sign}${Math.abs(points)} ${noun}`);
 }
 
 function barRow(name, evaluation, key) {

@@ -112,7 +112,7 @@ function draw() {
   find("#rollback").disabled = publishedId() === data.campaign.start_checkpoint_id;
   replace(find("#tiles"), panels.tiles(data.stats, published ? evaluationOf(published) : null));
   replace(find("#annotators"), panels.annotatorTable(data.stats.annotators));
-  const noisy = data.rounds.find((round) => round.noise);
+  const noisy = shownRound()?.noise ? shownRound() : data.rounds.find((round) => round.noise);
   replace(find("#answers"), panels.answerBars(data.stats.labels), panels.noiseText(noisy));
   replace(find("#rounds"), panels.roundTable(data.rounds, shownRound()?.id, {
     onSelect: select, onPublish: actions.publish, publishedId: publishedId(),
@@ -131,7 +131,8 @@ function drawPairs() {
   const { pairs } = data;
   find("#pairs-note").textContent = pairs.length > 0 ? "as annotators see them: A left, B right" : "";
   const more = data.pairCursor
-    ? element("button.button.small", { type: "button", onclick: morePairs }, "Show more") : null;
+    ? element("div.more-row", {}, element("button.button.small", { type: "button", onclick: morePairs }, "Show more"))
+    : null;
   const nothing = element("div.empty", {}, element("strong", {}, "No pairs yet"), "Collect runs: pairs are chosen among them and made into replays.");
   const box = find("#pairs");
   box.classList.toggle("pair-grid", pairs.length > 0);

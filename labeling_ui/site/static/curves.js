@@ -32,8 +32,9 @@ function layout(title, axis) {
   };
 }
 
-// Points of one stage become one line, in the order in which they came.
-function traces(points, value, colours) {
+// Points of one stage become one line, in the order in which they came. `relative`: as a share of
+// the line's first value, because the losses of different stages differ by orders of magnitude.
+function traces(points, value, colours, { relative = false } = {}) {
   const stages = new Map();
   for (const point of points) {
     if (typeof point[value] !== "number") continue;
@@ -42,7 +43,10 @@ function traces(points, value, colours) {
   }
   return [...stages].map(([stage, values], index) => ({
     type: "scatter", mode: values.length > 1 ? "lines" : "markers", name: stage,
-    x: values.map((_, step) => step + 1), y: values,
+    x: values.map((_, step) => step + 1),
+    y: relative ? values.map((one) => one / (values[0] || 1)) : values,
+    text: values.map((one) => one.toPrecision(4)),
+    hovertemplate: "%{text}",
     line: { width: 2, color: colours[index % colours.length] },
   }));
 }
@@ -50,17 +54,17 @@ function traces(points, value, colours) {
 // Returns whether there was anything to draw.
 export async function drawCurves(points) {
   const colours = [css("--accent"), "#b07a1e", "#8a5fb0", "#5d7f3a", "#b3261e", "#56636f"];
-  const losses = traces(points, "loss", colours);
+  const losses = traces(points, "loss", colours, { relative: true });
   const votes = traces(points, "mean_vote", colours);
   if (losses.length === 0 && votes.length === 0) return false;
   const plotly = await loadPlotly();
   const options = { displayModeBar: false, responsive: true };
   const box = find("#vote-chart");
   box.hidden = votes.length === 0;
-  await plotly.react(find("#loss-chart"), losses, layout("Loss"), options);
+  await plotly.react(find("#loss-chart"), losses, layout("Loss, share of its first value", { tickformat: ".0%" }), options);
   if (votes.length > 0) {
-    const half = { range: [0, 1], tickformat: ".0%" };
-    await plotly.react(box, votes, layout("Mean vote for the labelled winner", half), options);
+    const title = "Mean vote for the labelled winner";
+    await plotly.react(box, votes, layout(title, { tickformat: ".1%" }), options);
   }
   return true;
 }
