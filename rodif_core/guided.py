@@ -262,8 +262,9 @@ def _self_train(
         more = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
         histories = torch.cat([histories, more.histories])
         chunks = torch.cat([chunks, more.chains[:, -1]])
+    imitation = replace(config.guide, updates=config.guide.self_training_updates)
     policy = guide(
-        chosen.policy, histories, chunks, IMITATION, config.guide,
+        chosen.policy, histories, chunks, IMITATION, imitation,
         config.seed + extra + 1, _stage(progress, f"self-training {extra + 1}"),
     )  # fmt: skip
     return _try(checkpoint, policy, chosen.scale, scores, config)

@@ -98,12 +98,13 @@ class GuideConfig(_JsonConfig):
     scorer: Scorer = Scorer.GAUSSIAN_PROCESS
     score_updates: int = 4  # full-batch RoDiF updates of the throw-away copy
     scales: tuple[float, ...] = (1.0, 2.0)  # guidance scales tried, the gate picks one
-    updates: int = 200
+    updates: int = 150
     learning_rate: float = 1e-4
-    batch_size: int = 128
+    batch_size: int = 256
     ema_decay: float = 0.98
     selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
     require_success: bool = True  # keep only trajectories that the simulation calls successful
+    self_training_updates: int = 400
     self_training_rounds: int = 1  # more passes that add the liked ones of those rollouts
 
     def __post_init__(self) -> None:
@@ -118,6 +119,8 @@ class GuideConfig(_JsonConfig):
         )
         _require(self.updates >= 1, "updates", self.updates, "at least 1")
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "in (0, 1]")
+        extra = self.self_training_updates
+        _require(extra >= 1, "self_training_updates", extra, "at least 1")
         _require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
         _require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
         _require(

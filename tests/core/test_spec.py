@@ -73,6 +73,7 @@ def test_finetune_value_out_of_range_is_named(field: str, value: float) -> None:
         ("updates", 0),
         ("learning_rate", 2.0),
         ("batch_size", 0),
+        ("self_training_updates", 0),
         ("ema_decay", 1.0),
         ("selection_rollouts", 1),
         ("self_training_rounds", 9),
