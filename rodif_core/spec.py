@@ -7,6 +7,7 @@ All configurations are frozen, checked when they are made, and survive a trip th
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -75,10 +76,8 @@ class _JsonConfig:
     def to_json(self) -> dict[str, Any]:
         """Plain dict of JSON types; `from_json` gives back an equal object."""
         assert dataclasses.is_dataclass(self)
-        return {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in dataclasses.asdict(self).items()
-        }
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return plain
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Self:

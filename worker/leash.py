@@ -14,13 +14,18 @@ import sys
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
+def end_with_parent(signal_number: int) -> None:
+    """Let the kernel send `signal_number` to this process when its parent dies (Linux only)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal_number)
+
+
 def main(arguments: list[str]) -> None:
     """Put the leash on, then become the command."""
     starter, signal_number, command = int(arguments[0]), int(arguments[1]), arguments[2:]
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal_number)
-        if os.getppid() != starter:
-            sys.exit(0)  # the starter died before the leash was on
+    end_with_parent(signal_number)
+    if sys.platform == "linux" and os.getppid() != starter:
+        sys.exit(0)  # the starter died before the leash was on
     os.execvp(command[0], command)
 
 

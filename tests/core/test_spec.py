@@ -88,3 +88,10 @@ def test_guide_value_out_of_range_is_named(field: str, value: object) -> None:
 def test_rollout_value_out_of_range_is_named(field: str, value: int) -> None:
     with pytest.raises(ValueOutOfRangeError, match=field):
         RolloutConfig(**{field: value})
+
+
+def test_to_json_gives_plain_types_at_every_depth() -> None:
+    data = FinetuneConfig().to_json()
+    assert json.loads(json.dumps(data)) == data
+    assert type(data["guide"]["scales"]) is list
+    assert type(data["guide"]["scorer"]) is str

@@ -10,6 +10,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import signal
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -19,6 +20,7 @@ from rodif_core.errors import RodifError
 from rodif_core.spec import FinetuneMethod, TaskName
 from worker.cli.benchmarks import avoid
 from worker.cli.options import number_list
+from worker.leash import end_with_parent
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -75,7 +77,12 @@ def make_missing(runs: Sequence[avoid.Run], path: Path, workers: int) -> list[Ro
     console = Console(stderr=True)
     with (
         Progress(*columns, console=console) as bar,
-        ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(
+            workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=end_with_parent,
+            initargs=(signal.SIGTERM,),
+        ) as pool,
     ):
         task = bar.add_task("runs", total=len(missing))
         futures = [pool.submit(avoid.execute, run) for run in missing]
