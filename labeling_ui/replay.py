@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labeling_ui.scene import Poses, Shape, body_poses, hit_geom, scene_model, smooth
+from labeling_ui.scene import Array, Poses, Shape, body_poses, hit_geom, scene_model, smooth
 from labeling_ui.thumbnail import make_thumbnail
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.tasks.base import Task
@@ -147,7 +147,7 @@ class _Track:
         self._add_surroundings(scene, root)
         self._trail = self._add_trail(scene, root)
         self._hit = _add_hit(scene, root, shapes, side.hit)
-        self._shown: dict[int, tuple[bytes, bytes]] = {}
+        self._shown: dict[int, tuple[Array, Array]] = {}  # position and wxyz of each body
 
     def _add_surroundings(self, scene: Any, root: str) -> None:
         """A tinted mat under the work space and the side's letter in front of it."""
@@ -191,11 +191,14 @@ class _Track:
         if frame >= len(poses):
             return
         for body, handle in self._bodies.items():
+            # viser compares at some cost; what stays is not even offered to it.
+            before = self._shown.get(body)
             position, wxyz = poses.positions[frame, body], poses.wxyz[frame, body]
-            pose = (position.tobytes(), wxyz.tobytes())
-            if self._shown.get(body) != pose:
-                self._shown[body] = pose
-                handle.position, handle.wxyz = position, wxyz
+            if before is None or not np.array_equal(before[0], position):
+                handle.position = position
+            if before is None or not np.array_equal(before[1], wxyz):
+                handle.wxyz = wxyz
+            self._shown[body] = position, wxyz
         if frame and frame % SUBFRAMES == 0:
             self._trail[frame // SUBFRAMES - 1].visible = True
         if frame == len(poses) - 1:
