@@ -42,12 +42,14 @@ class Site:
 
 
 @contextmanager
-def demo() -> Iterator[Site]:
-    """The site that `rodif demo` leaves running; stopped at the end."""
+def demo(options: list[str]) -> Iterator[Site]:
+    """The site that `rodif demo` with these options leaves running; stopped at the end."""
     with tempfile.TemporaryDirectory(prefix="rodif-screenshots-") as folder:
         command = [str(Path(sys.executable).parent / "rodif"), "demo", "--port", "0"]
         process = subprocess.Popen(
-            [*command, "--state", str(Path(folder) / "state")], stdout=subprocess.PIPE, text=True
+            [*command, "--state", str(Path(folder) / "state"), *options],
+            stdout=subprocess.PIPE,
+            text=True,
         )
         try:
             assert process.stdout is not None
@@ -199,12 +201,12 @@ def main() -> None:
     parser.add_argument("--admin", default="admin", help="name of the admin account")
     parser.add_argument("--admin-password", help="its password, needed with --url")
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder of the PNGs")
-    args = parser.parse_args()
+    args, options = parser.parse_known_args()  # the rest is for the demo, such as --pairs 100
     if args.url is None:
-        with demo() as site:
+        with demo(options) as site:
             take(site, args.out)
-    elif args.admin_password is None:
-        parser.error("--url needs --admin-password")
+    elif args.admin_password is None or options:
+        parser.error("--url needs --admin-password, and takes no options of the demo")
     else:
         take(Site(args.url.rstrip("/"), args.admin, args.admin_password), args.out)
 
