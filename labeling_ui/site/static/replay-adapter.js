@@ -40,8 +40,20 @@
   const time = () => Number(slider()?.getAttribute("aria-valuenow") ?? 0);
   const duration = () => Number(slider()?.getAttribute("aria-valuemax") ?? 0);
 
-  const setPaused = (wanted) => {
-    if (bar() && paused() !== wanted) playButton().click();
+  // What the page asked for last. The client applies a click or a seek some frames later, on a busy
+  // machine much later, so one click can be swallowed or undone: look again until it holds.
+  let asked = 0;
+  const setPaused = (wanted, tries = 20) => {
+    asked += 1;
+    const mine = asked;
+    const look = (left) => {
+      if (mine !== asked || left === 0) return;
+      const differs = bar() !== null && paused() !== wanted;
+      if (differs) playButton().click();
+      // A click that is only slow must not be answered by a second one that undoes it.
+      setTimeout(look, differs ? 400 : 60, left - 1);
+    };
+    look(tries);
   };
 
   // React listens to the native setter only through a bubbling input event. Seeking pauses.
@@ -56,8 +68,7 @@
 
   const restart = () => {
     seek(0);
-    // React applies the pause of the seek first; playing in the same tick would be undone.
-    setTimeout(() => setPaused(false), 30);
+    setPaused(false);
   };
 
   const setSpeed = async (factor) => {
@@ -136,10 +147,13 @@
   const operations = {
     play: () => setPaused(false),
     pause: () => setPaused(true),
-    toggle: () => playButton()?.click(),
+    toggle: () => setPaused(!paused()),
     restart,
-    seek,
-    step: (seconds) => seek(time() + seconds),
+    seek: (seconds) => {
+      asked += 1; // a seek pauses: an earlier wish to play is over
+      seek(seconds);
+    },
+    step: (seconds) => operations.seek(time() + seconds),
     speed: setSpeed,
     camera: moveCamera,
   };
