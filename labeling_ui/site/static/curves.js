@@ -23,11 +23,11 @@ function layout(title, axis) {
   return {
     title: { text: title, font: { ...font, size: 14, color: css("--ink") }, x: 0, xref: "paper", xanchor: "left" },
     font, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-    margin: { l: 48, r: 12, t: 40, b: 44 },
+    margin: { l: 48, r: 12, t: 36, b: 72 },
     xaxis: { title: { text: "update", font, standoff: 8 }, gridcolor: line, zerolinecolor: line, rangemode: "tozero" },
     yaxis: { gridcolor: line, zerolinecolor: line, ...axis },
     showlegend: true,
-    legend: { orientation: "h", x: 1, xanchor: "right", y: 1.02, yanchor: "bottom" },
+    legend: { orientation: "h", x: 0, y: -0.26, yanchor: "top" },
     hovermode: "x unified",
   };
 }
