@@ -264,6 +264,7 @@ def test_label_whose_answer_was_lost_is_stored_once(
 
     page.route("**/api/v1/labels", lose_the_first_answer)
     driver.press("ArrowLeft")
+    studio.wait_for_labels(campaign, 1)
     until(page, "!Object.keys(localStorage).some((key) => key.startsWith('rodif-outbox'))")
     assert len(keys) == 2 and keys[0] == keys[1]
     assert len(studio.labels(campaign)) == 1
