@@ -50,7 +50,7 @@ class DemoConfig:
     labels: int = 80  # preferences; pairs that cannot be told apart are answered "equal" besides
     annotators: int = 5
     flip_rate: float = 0.3
-    evaluation_episodes: int = 200
+    evaluation_episodes: int = 400
     comparison_updates: int = 10  # full-batch updates of literal RoDiF and DP-DPO
     seed: int = 0
 
