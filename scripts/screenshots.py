@@ -187,8 +187,8 @@ def take_campaign(page: Page, site: Site, campaign: int, out: Path) -> None:
     page.wait_for_timeout(500)
     save(page, out / "start-round.png")
     page.keyboard.press("Escape")
-    published = page.locator("#checkpoints tr", has_text="published")
-    published.get_by_role("button", name="Lineage").click()
+    made = page.locator("#checkpoints tr", has_text="-round-")  # the first round is the oldest
+    made.last.get_by_role("button", name="Lineage").click()
     page.get_by_role("dialog").wait_for()
     page.wait_for_timeout(500)
     save(page, out / "lineage.png")
