@@ -41,19 +41,25 @@
   const duration = () => Number(slider()?.getAttribute("aria-valuemax") ?? 0);
 
   // What the page asked for last. The client applies a click or a seek some frames later, on a busy
-  // machine much later, so one click can be swallowed or undone: look again until it holds.
+  // machine seconds later: one click can be swallowed, and a second one too early undoes the first.
+  const SETTLE_MS = 3000;
   let asked = 0;
-  const setPaused = (wanted, tries = 20) => {
+  const setPaused = (wanted) => {
     asked += 1;
     const mine = asked;
-    const look = (left) => {
-      if (mine !== asked || left === 0) return;
-      const differs = bar() !== null && paused() !== wanted;
-      if (differs) playButton().click();
-      // A click that is only slow must not be answered by a second one that undoes it.
-      setTimeout(look, differs ? 400 : 60, left - 1);
+    const started = performance.now();
+    let clicked = -SETTLE_MS;
+    const look = () => {
+      const now = performance.now();
+      if (mine !== asked || now - started > 4 * SETTLE_MS) return;
+      if (bar() && paused() !== wanted && now - clicked >= SETTLE_MS) {
+        clicked = now;
+        playButton().click();
+      }
+      // A seek that is still on its way may pause again for a moment after it looked right.
+      if (now - started < 1000 || paused() !== wanted) setTimeout(look, 60);
     };
-    look(tries);
+    look();
   };
 
   // React listens to the native setter only through a bubbling input event. Seeking pauses.
