@@ -45,9 +45,9 @@ Say = Callable[[str], None]
 class DemoConfig:
     """Sizes of the demo; the defaults take some minutes on 2 cores."""
 
-    episodes: int = 80
+    episodes: int = 120
     pairs: int = 180
-    labels: int = 80  # preferences; pairs that cannot be told apart are answered "equal" besides
+    labels: int = 100  # preferences; pairs that cannot be told apart are answered "equal" besides
     annotators: int = 5
     flip_rate: float = 0.3
     evaluation_episodes: int = 400
