@@ -18,7 +18,7 @@ SIZES = {
     "pairs": 60,
     "labels": 30,
     "annotators": 3,
-    "flip-rate": 0.1,
+    "flip-rate": 0.2,
     "evaluation-episodes": 60,
     "comparison-updates": 2,
 }
@@ -42,7 +42,7 @@ def test_headless_demo_writes_the_table_and_leaves_nothing_running(tmp_path: Pat
         assert all(0 <= result[name][rate] <= 1 for rate in RATES), name
         assert result[name]["n"] == 60
     assert result["labels"]["total"] == 30
-    assert result["labels"]["flipped"] == 3
+    assert result["labels"]["flipped"] == 6
     assert {"start", "collect", "replays", "labels", "rounds", "total"} <= set(result["seconds"])
     # So few labels may steer too little for the demo's own bar; that it steers is certain.
     before, after = result["before"], result["after"]

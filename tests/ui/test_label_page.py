@@ -56,7 +56,7 @@ def test_replay_plays_by_itself_and_obeys_keys_and_the_transport_bar(
     driver.wait_state("state.speed === 0.5")
     driver.press("r")
     driver.wait_state("!state.paused && state.t < 1.4")
-    driver.press("Space")
+    driver.click("Pause")
     driver.wait_state("state.paused")
 
 
