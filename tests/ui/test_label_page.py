@@ -49,6 +49,8 @@ def test_replay_plays_by_itself_and_obeys_keys_and_the_transport_bar(
     driver.press(",")
     driver.press(",")
     driver.wait_state("Math.abs(state.t - 1.465) < 0.01")
+    driver.page.wait_for_timeout(1000)
+    assert driver.state()["t"] == pytest.approx(1.465, abs=0.01), "a step stays where it is"
     driver.press("]")
     driver.wait_state("state.speed === 2 && state.paused")
     driver.press("[")

@@ -40,41 +40,50 @@
   const time = () => Number(slider()?.getAttribute("aria-valuenow") ?? 0);
   const duration = () => Number(slider()?.getAttribute("aria-valuemax") ?? 0);
 
-  // What the page asked for last. The client applies a click or a seek some frames later, on a busy
-  // machine seconds later: one click can be swallowed, and a second one too early undoes the first.
-  const SETTLE_MS = 3000;
-  let asked = 0;
+  // The client's own state is what it is told here and nothing else, so the page's last wish is the
+  // truth: a toggle turns the wish round, not whatever a busy client happens to show at the moment.
+  const RETRY_MS = 500;
+  let wantPaused = parameters.get("start") === "paused";
+  let sought = null; // s; where the last seek went, until the replay plays or is paused elsewhere
+  let clicked = -RETRY_MS;
+  const settle = () => {
+    const now = performance.now();
+    if (!bar() || paused() === wantPaused || now - clicked < RETRY_MS) return;
+    clicked = now;
+    playButton().click();
+  };
   const setPaused = (wanted) => {
-    asked += 1;
-    const mine = asked;
-    const started = performance.now();
-    let clicked = -SETTLE_MS;
-    const look = () => {
-      const now = performance.now();
-      if (mine !== asked || now - started > 4 * SETTLE_MS) return;
-      if (bar() && paused() !== wanted && now - clicked >= SETTLE_MS) {
-        clicked = now;
-        playButton().click();
-      }
-      // A seek that is still on its way may pause again for a moment after it looked right.
-      if (now - started < 1000 || paused() !== wanted) setTimeout(look, 60);
-    };
-    look();
+    wantPaused = wanted;
+    sought = null;
+    clicked = -RETRY_MS;
+    settle();
   };
 
-  // React listens to the native setter only through a bubbling input event. Seeking pauses.
+  // React keeps a component tree beside the page's elements.
+  const fiberOf = (element, prefix) => {
+    const key = element && Object.keys(element).find((name) => name.startsWith(prefix));
+    return key ? element[key] : null;
+  };
+
+  // Through the slider's handler: the number field beside it rounds to 0.1 s, some frames later.
+  // The client pauses when it seeks.
   const seek = (seconds) => {
-    const input = inputs()[0];
-    if (!input) return;
-    const value = Math.min(Math.max(seconds, 0), Math.max(duration() - 0.001, 0));
-    const setter = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set;
-    setter.call(input, value.toFixed(4));
-    input.dispatchEvent(new Event("input", { bubbles: true }));
+    let fiber = fiberOf(slider(), "__reactFiber$");
+    const seeks = (props) => typeof props?.onChange === "function" && props.max === duration();
+    while (fiber && !seeks(fiber.memoizedProps)) fiber = fiber.return;
+    if (!fiber) {
+      post({ kind: "replay-error", message: "the replay cannot be moved in time" });
+      return;
+    }
+    sought = Math.min(Math.max(seconds, 0), Math.max(duration() - 0.001, 0));
+    fiber.memoizedProps.onChange(sought);
+    wantPaused = true;
   };
 
   const restart = () => {
     seek(0);
-    setPaused(false);
+    sought = null;
+    wantPaused = false; // clicked as soon as the seek's own pause shows
   };
 
   const setSpeed = async (factor) => {
@@ -108,12 +117,11 @@
     log(...parts);
   };
 
-  // The client keeps its viewer state in a React context; walk the component tree to it.
+  // The client keeps its viewer state in a React context.
   const findViewer = () => {
     for (const element of [document.getElementById("root"), ...document.body.children]) {
-      const key = element && Object.keys(element).find((name) => name.startsWith("__reactContainer$"));
-      if (!key) continue;
-      const waiting = [element[key]];
+      const root = fiberOf(element, "__reactContainer$");
+      const waiting = root ? [root] : [];
       while (waiting.length > 0) {
         const fiber = waiting.pop();
         const viewer = fiber.memoizedProps?.value;
@@ -153,13 +161,10 @@
   const operations = {
     play: () => setPaused(false),
     pause: () => setPaused(true),
-    toggle: () => setPaused(!paused()),
+    toggle: () => setPaused(!wantPaused),
     restart,
-    seek: (seconds) => {
-      asked += 1; // a seek pauses: an earlier wish to play is over
-      seek(seconds);
-    },
-    step: (seconds) => operations.seek(time() + seconds),
+    seek,
+    step: (seconds) => seek((sought ?? time()) + seconds),
     speed: setSpeed,
     camera: moveCamera,
   };
@@ -204,9 +209,9 @@
   let posted = "";
   setInterval(() => {
     if (!slider()) return;
+    settle();
     if (!ready) {
       ready = true;
-      if (parameters.get("start") === "paused") setPaused(true);
       post({ kind: "replay-ready", duration: duration() });
     }
     const state = {
