@@ -36,7 +36,8 @@ from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Score
 from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-SELECTION_SEED = 7_000_000  # rollouts that choose a scale never share a seed with an evaluation
+# Rollouts inside a round never share a seed with an evaluation, nor with each other by use.
+SELECTION_SEED, SEEDS_PER_ROUND, SEEDS_PER_USE = 7_000_000, 10_000, 1_000
 IMITATION = 1.0  # guidance scale that only imitates
 NOISE = 0.04  # of a rate near 1 over 100 rollouts: two standard errors
 SUCCESS_SLACK = 0.03  # a scale may lose this much success against the parent on the same seeds
@@ -79,7 +80,6 @@ class Trial:
     success: float
     off_support: float
     predicted: float  # share of rollouts that succeed and that the labels predict to be preferred
-    liked: tuple[Trajectory, ...]  # those rollouts
 
     def to_json(self) -> dict[str, float]:
         """Plain JSON types."""
@@ -119,10 +119,9 @@ def finetune_guided(
     chosen = choose(base, trials)
     retrained: list[Trial] = []
     for extra in range(config.guide.self_training_rounds):
-        fresh = _self_train(
-            checkpoint, chosen, [*trials, *retrained], scores, histories, chunks, config, extra,
-            progress,
-        )  # fmt: skip
+        fresh = _self_train(checkpoint, chosen, scores, config, extra, progress)
+        if fresh is None:
+            break
         retrained.append(fresh)
         _tell(progress, "choose again", (extra + 1) / config.guide.self_training_rounds, fresh)
         chosen = fresh if improves(base, chosen, fresh) else chosen
@@ -229,42 +228,50 @@ def _try(
     config: FinetuneConfig,
 ) -> Trial:
     """Fresh rollouts of a policy; all trials of a round use the same seeds."""
-    seed = SELECTION_SEED + 10_000 * config.seed
-    settings = RolloutConfig(config.guide.selection_rollouts, seed)
+    settings = RolloutConfig(config.guide.selection_rollouts, _fresh_seed(config))
     rollouts = rollout(replace(checkpoint, policy=policy), settings)
-    predicted = scores.path_utility.predict(PathFeatures.of(rollouts)) > scores.path_threshold
-    liked = tuple(
-        t for t, preferred in zip(rollouts, predicted, strict=True) if preferred and t.success
-    )
     off = off_support_share(rollouts, checkpoint.policy.normaliser, checkpoint.support)
     success = float(np.mean([trajectory.success for trajectory in rollouts]))
-    return Trial(scale, policy, success, off, len(liked) / len(rollouts), liked)
+    return Trial(scale, policy, success, off, len(_liked(rollouts, scores)) / len(rollouts))
+
+
+def _liked(rollouts: Sequence[Trajectory], scores: Scores) -> list[Trajectory]:
+    """The rollouts that succeed and that the labels predict to be preferred."""
+    predicted = scores.path_utility.predict(PathFeatures.of(rollouts)) > scores.path_threshold
+    pairs = zip(rollouts, predicted, strict=True)
+    return [trajectory for trajectory, preferred in pairs if preferred and trajectory.success]
+
+
+def _fresh_seed(config: FinetuneConfig, use: int = 0) -> int:
+    return SELECTION_SEED + SEEDS_PER_ROUND * config.seed + SEEDS_PER_USE * use
 
 
 def _self_train(
     checkpoint: Checkpoint,
     chosen: Trial,
-    trials: Sequence[Trial],
     scores: Scores,
-    histories: Tensor,
-    chunks: Tensor,
     config: FinetuneConfig,
     extra: int,
     progress: Progress | None,
-) -> Trial:
-    """Imitate the winners and all liked rollouts of the trials, from the chosen policy on.
+) -> Trial | None:
+    """Imitate the chosen policy's own liked rollouts, made with less noise than it has itself.
 
-    The rollouts exist already; what failed among them is what this pass forgets. Its scale is 1:
-    the policy is where it should go, and pushing on costs success.
+    Most failures begin where the policy wavers between two ways round an obstacle. With less noise
+    it wavers less and still takes many ways, and imitation makes that its own. Its scale is 1: the
+    policy is where it should go, and pushing on costs success. None: no rollout was liked.
     """
-    liked = [trajectory for trial in trials for trajectory in trial.liked]
-    if liked:
-        more = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
-        histories = torch.cat([histories, more.histories])
-        chunks = torch.cat([chunks, more.chains[:, -1]])
-    imitation = replace(config.guide, updates=config.guide.self_training_updates)
+    guiding = config.guide
+    settings = RolloutConfig(guiding.self_training_rollouts, _fresh_seed(config, extra + 1))
+    steady = rollout(
+        replace(checkpoint, policy=chosen.policy), settings, noise_scale=guiding.self_training_noise
+    )
+    liked = _liked(steady, scores)
+    if not liked:
+        return None
+    lessons = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
     policy = guide(
-        chosen.policy, histories, chunks, IMITATION, imitation,
+        chosen.policy, lessons.histories, lessons.chains[:, -1], IMITATION,
+        replace(guiding, updates=guiding.self_training_updates),
         config.seed + extra + 1, _stage(progress, f"self-training {extra + 1}"),
     )  # fmt: skip
     return _try(checkpoint, policy, chosen.scale, scores, config)

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from rodif_core.diffusion.chain import noise_entries
+from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.spec import RolloutConfig
@@ -27,18 +28,25 @@ Progress = Callable[[int, int], None]  # episodes done, episodes in all
 
 
 def rollout(
-    checkpoint: Checkpoint, config: RolloutConfig, *, progress: Progress | None = None
+    checkpoint: Checkpoint,
+    config: RolloutConfig,
+    *,
+    noise_scale: float = 1.0,
+    progress: Progress | None = None,
 ) -> list[Trajectory]:
     """Run `config.episodes` episodes; episode i draws start and policy noise from seed + i.
 
-    The same checkpoint and config give the same bits on the same machine.
+    noise_scale in [0, 1] shrinks the noise between denoising steps: 1 samples the policy, less
+    makes it more decided. The same arguments give the same bits on the same machine.
     """
+    if not 0 <= noise_scale <= 1:
+        raise ValueOutOfRangeError("noise_scale", noise_scale, "in [0, 1]")
     task = get_task(checkpoint.task)
     done: list[Trajectory] = []
     for first in range(0, config.episodes, config.max_parallel):
         count = min(config.max_parallel, config.episodes - first)
         seeds = [config.seed + first + i for i in range(count)]
-        done += _rollout_batch(checkpoint, task, seeds)
+        done += _rollout_batch(checkpoint, task, seeds, noise_scale)
         if progress is not None:
             progress(len(done), config.episodes)
     return done
@@ -73,7 +81,9 @@ class _Recorder:
         self.paths.append(path)
 
 
-def _rollout_batch(checkpoint: Checkpoint, task: Task, seeds: list[int]) -> list[Trajectory]:
+def _rollout_batch(
+    checkpoint: Checkpoint, task: Task, seeds: list[int], noise_scale: float
+) -> list[Trajectory]:
     policy = checkpoint.policy
     size = policy.config
     contexts = [task.sample_context(np.random.default_rng([seed, 0])) for seed in seeds]
@@ -88,7 +98,7 @@ def _rollout_batch(checkpoint: Checkpoint, task: Task, seeds: list[int]) -> list
         active = np.flatnonzero(~env.done)
         offset = step % size.executed_steps
         if offset == 0:
-            _decide(policy, records, generators, active, chunks)
+            _decide(policy, records, generators, active, chunks, noise_scale)
         actions = np.clip(chunks[:, offset], -task.action_limit, task.action_limit)
         observations = env.step(actions)
         qpos, paths, steps_done = env.qpos, env.paths, env.steps
@@ -99,7 +109,7 @@ def _rollout_batch(checkpoint: Checkpoint, task: Task, seeds: list[int]) -> list
         step += 1
     outcomes = env.outcomes()
     return [
-        _finish(record, checkpoint, task, seed, context, outcome)
+        _finish(record, checkpoint, task, seed, context, outcome, noise_scale)
         for record, seed, context, outcome in zip(records, seeds, contexts, outcomes, strict=True)
     ]
 
@@ -116,11 +126,13 @@ def _decide(
     generators: list[torch.Generator],
     active: NDArray[np.intp],
     chunks: NDArray[np.float32],
+    noise_scale: float,
 ) -> None:
     size = policy.config
     histories = np.stack([records[i].history(size.observation_steps) for i in active])
     shape = (noise_entries(policy.schedule), size.predicted_steps, size.action_dim)
     noise = torch.stack([torch.randn(shape, generator=generators[i]) for i in active])
+    noise[:, 1:] *= noise_scale  # the first entry is a^K, where the chain begins
     actions, chains = policy.act(torch.from_numpy(histories), noise)
     chunks[active] = actions.numpy()
     for row, i in enumerate(active):
@@ -134,6 +146,7 @@ def _finish(
     seed: int,
     context: dict[str, Any],
     outcome: dict[str, Any],
+    noise_scale: float,
 ) -> Trajectory:
     return Trajectory(
         observations=np.stack(record.observations),
@@ -151,5 +164,6 @@ def _finish(
             "checkpoint": checkpoint.digest,
             "mujoco_version": mujoco.__version__,
             "control_dt": task.control_dt,
+            "noise_scale": noise_scale,
         },
     )

@@ -103,8 +103,10 @@ class GuideConfig(_JsonConfig):
     ema_decay: float = 0.98
     selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
     require_success: bool = True  # keep only trajectories that the simulation calls successful
+    self_training_rounds: int = 1  # passes that imitate the policy's own liked cautious rollouts
+    self_training_rollouts: int = 200  # of each pass
+    self_training_noise: float = 0.6  # of those rollouts, in units of the sampler's own noise
     self_training_updates: int = 400
-    self_training_rounds: int = 1  # more passes that add the liked ones of those rollouts
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scorer", parse_name(Scorer, self.scorer, "scorer"))
@@ -120,14 +122,12 @@ class GuideConfig(_JsonConfig):
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "in (0, 1]")
         extra = self.self_training_updates
         _require(extra >= 1, "self_training_updates", extra, "at least 1")
+        noise = self.self_training_noise
+        _require(0 <= noise <= 1, "self_training_noise", noise, "in [0, 1]")
         _require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
         _require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
-        _require(
-            self.selection_rollouts >= 10,
-            "selection_rollouts",
-            self.selection_rollouts,
-            "at least 10",
-        )
+        for name in ("selection_rollouts", "self_training_rollouts"):
+            _require(getattr(self, name) >= 10, name, getattr(self, name), "at least 10")
         _require(
             0 <= self.self_training_rounds <= 5,
             "self_training_rounds",

@@ -190,7 +190,7 @@ def test_standardise_gives_zeros_when_scores_do_not_differ() -> None:
 
 
 def trial(scale: float, success: float, off: float, predicted: float) -> Trial:
-    return Trial(scale, tiny_policy(), success, off, predicted, ())
+    return Trial(scale, tiny_policy(), success, off, predicted)
 
 
 def test_choice_prefers_what_labels_predict_among_sound_scales() -> None:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from rodif_core.diffusion.chain import chain_means
 from rodif_core.drift import fit_support, nearest_distance, off_support_share, visited_states
+from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.evaluate import evaluate, thin_path
 from rodif_core.gate import judge
 from rodif_core.intervals import wilson_interval
@@ -36,6 +38,24 @@ def test_episode_depends_on_its_own_seed_only(episodes: list[Trajectory]) -> Non
 
 def test_different_seeds_give_different_noise(episodes: list[Trajectory]) -> None:
     assert not np.array_equal(episodes[0].chains[0, 0], episodes[1].chains[0, 0])
+
+
+def test_rollout_without_noise_follows_the_means_from_the_same_beginnings(
+    episodes: list[Trajectory],
+) -> None:
+    still = rollout(tiny_checkpoint(), RolloutConfig(episodes=1, seed=40), noise_scale=0.0)[0]
+    assert np.array_equal(still.chains[0, 0], episodes[0].chains[0, 0])
+    assert not np.array_equal(still.chains[0, 1], episodes[0].chains[0, 1])
+    policy = tiny_checkpoint().policy
+    history = policy.normaliser.observation(torch.from_numpy(still.histories[:1].copy()))
+    chain = torch.from_numpy(still.chains[:1].copy())
+    means = chain_means(policy.denoiser, policy.schedule, history, chain)
+    assert torch.allclose(chain[:, 1 : means.shape[1] + 1], means, atol=1e-5)
+
+
+def test_noise_scale_out_of_range_is_named() -> None:
+    with pytest.raises(ValueOutOfRangeError, match=r"noise_scale.*1\.5.*\[0, 1\]"):
+        rollout(tiny_checkpoint(), RolloutConfig(episodes=1), noise_scale=1.5)
 
 
 def test_recorded_actions_are_the_executed_part_of_the_chains(

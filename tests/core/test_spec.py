@@ -74,6 +74,8 @@ def test_finetune_value_out_of_range_is_named(field: str, value: float) -> None:
         ("learning_rate", 2.0),
         ("batch_size", 0),
         ("self_training_updates", 0),
+        ("self_training_rollouts", 9),
+        ("self_training_noise", 1.1),
         ("ema_decay", 1.0),
         ("selection_rollouts", 1),
         ("self_training_rounds", 9),
