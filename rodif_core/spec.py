@@ -103,7 +103,7 @@ class GuideConfig(_JsonConfig):
     ema_decay: float = 0.98
     selection_rollouts: int = 100  # fresh rollouts per scale, for the choice among `scales`
     require_success: bool = True  # keep only trajectories that the simulation calls successful
-    self_training_rounds: int = 1  # passes that imitate the policy's own liked cautious rollouts
+    self_training_rounds: int = 2  # passes that imitate the policy's own liked cautious rollouts
     self_training_rollouts: int = 200  # of each pass
     self_training_noise: float = 0.6  # of those rollouts, in units of the sampler's own noise
     self_training_updates: int = 400
