@@ -15,13 +15,15 @@ from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Response
 from fastapi.staticfiles import StaticFiles
 from fastapi.templating import Jinja2Templates
+from sqlalchemy import select
+from sqlalchemy.orm import InstrumentedAttribute
 
 from server.api.access import COOKIE, Anyone, UseServices, who
 from server.api.services import services_of
 from server.errors import ArtifactError, NotFoundError, NotSignedInError
 from server.sign_in import Me
 from server.states import Role
-from server.store.tables import Campaign
+from server.store.tables import Campaign, Pair
 
 PAGE_POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
@@ -58,7 +60,16 @@ def install(app: FastAPI) -> None:
     app.state.templates = Jinja2Templates(directory=site / "templates")
     app.state.ui_version = f"{app.version}+{_fingerprint(site)}"
     app.include_router(router)
-    app.mount("/static", StaticFiles(directory=site / "static", check_dir=False), name="static")
+    app.mount("/static", _SiteFiles(directory=site / "static", check_dir=False), name="static")
+
+
+class _SiteFiles(StaticFiles):
+    """Files whose names stay the same from version to version: browsers ask each time."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
 
 
 def _fingerprint(site: Path) -> str:
@@ -82,7 +93,8 @@ def _home(me: Me) -> str:
 
 
 def _to_sign_in(request: Request) -> RedirectResponse:
-    return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", status_code=303)
+    asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    return RedirectResponse(f"/sign-in?next={quote(asked, safe='/')}", status_code=303)
 
 
 def _render(request: Request, template: str, **context: Any) -> Response:
@@ -152,7 +164,13 @@ def admin_campaign(request: Request, campaign_id: int) -> Response:
     return _page(request, "admin_campaign.html", admin=True, campaign_id=campaign_id)
 
 
-def _artifact(services: UseServices, sha256: str, media_type: str) -> FileResponse:
+def _artifact(
+    services: UseServices, sha256: str, column: InstrumentedAttribute[str | None], media_type: str
+) -> FileResponse:
+    """A file that some pair shows; episodes and checkpoints, which carry the outcome, are none."""
+    with services.database.read() as session:
+        if session.scalar(select(Pair.id).where(column == sha256).limit(1)) is None:
+            raise NotFoundError("file of a pair", sha256)
     path = services.artifacts.path(sha256)
     if not path.is_file():
         raise ArtifactError(f"artifact {sha256} is missing")
@@ -163,13 +181,13 @@ def _artifact(services: UseServices, sha256: str, media_type: str) -> FileRespon
 @router.api_route("/replays/{sha256}.viser", methods=["GET", "HEAD"])
 def replay(sha256: str, _me: Anyone, services: UseServices) -> FileResponse:
     """A recording for the replay client."""
-    return _artifact(services, sha256, "application/octet-stream")
+    return _artifact(services, sha256, Pair.replay_sha256, "application/octet-stream")
 
 
 @router.api_route("/thumbnails/{sha256}.webp", methods=["GET", "HEAD"])
 def thumbnail(sha256: str, _me: Anyone, services: UseServices) -> FileResponse:
     """An animated picture of a pair."""
-    return _artifact(services, sha256, "image/webp")
+    return _artifact(services, sha256, Pair.thumbnail_sha256, "image/webp")
 
 
 @router.get("/replay-client/")

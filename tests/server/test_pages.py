@@ -8,6 +8,7 @@ import re
 import pytest
 
 from server.pages import REPLAY_CLIENT_POLICY
+from server.store.tables import Pair
 from tests.server.world import World
 
 PAGES = ["/label", "/label/1", "/admin", "/admin/campaigns/1"]
@@ -18,6 +19,11 @@ def test_strangers_are_sent_to_sign_in_and_back(sqlite_world: World, path: str) 
     answer = sqlite_world.browser().get(path, follow_redirects=False)
     assert answer.status_code == 303
     assert answer.headers["location"] == f"/sign-in?next={path}"
+
+
+def test_what_an_address_asks_for_survives_the_sign_in(sqlite_world: World) -> None:
+    answer = sqlite_world.browser().get("/label/1?view=top&x=a b", follow_redirects=False)
+    assert answer.headers["location"] == "/sign-in?next=/label/1%3Fview%3Dtop%26x%3Da%2520b"
 
 
 @pytest.mark.parametrize(("name", "home"), [("ada", "/admin"), ("ann", "/label")])
@@ -82,6 +88,7 @@ def test_a_replay_is_served_for_ever_and_in_part(sqlite_world: World) -> None:
     artifacts = sqlite_world.app.state.services.artifacts
     data = bytes(range(256)) * 40
     sha256 = artifacts.put(data)
+    _show(sqlite_world, sha256)
     browser = sqlite_world.signed_in("ann")
     answer = browser.get(f"/replays/{sha256}.viser")
     assert answer.content == data
@@ -93,6 +100,27 @@ def test_a_replay_is_served_for_ever_and_in_part(sqlite_world: World) -> None:
     assert (part.status_code, part.content) == (206, data[:10])
     thumbnail = browser.get(f"/thumbnails/{sha256}.webp")
     assert thumbnail.headers["content-type"] == "image/webp"
+
+
+def _show(world: World, sha256: str) -> None:
+    _, [pair_id] = world.add_campaign(pairs=1)
+    with world.database.write() as session:
+        pair = session.get_one(Pair, pair_id)
+        pair.replay_sha256 = pair.thumbnail_sha256 = sha256
+
+
+def test_a_stored_file_that_no_pair_shows_is_not_handed_out(sqlite_world: World) -> None:
+    sha256 = sqlite_world.app.state.services.artifacts.put(b"an episode with its outcome")
+    for path in (f"/replays/{sha256}.viser", f"/thumbnails/{sha256}.webp"):
+        assert sqlite_world.signed_in("ann").get(path).status_code == 404
+
+
+def test_browsers_ask_for_site_files_each_time(sqlite_world: World) -> None:
+    browser = sqlite_world.browser()
+    answer = browser.get("/static/label.js")
+    assert answer.headers["cache-control"] == "no-cache"
+    again = browser.get("/static/label.js", headers={"If-None-Match": answer.headers["etag"]})
+    assert (again.status_code, again.headers["cache-control"]) == (304, "no-cache")
 
 
 @pytest.mark.parametrize("name", ["..%2f..%2frodif", "A" * 64, "short"])
