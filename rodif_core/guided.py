@@ -119,7 +119,7 @@ def finetune_guided(
     chosen = choose(base, trials)
     retrained: list[Trial] = []
     for extra in range(config.guide.self_training_rounds):
-        fresh = _self_train(checkpoint, chosen, scores, config, extra, progress)
+        fresh = _self_train(checkpoint, base, chosen, scores, config, extra, progress)
         if fresh is None:
             break
         retrained.append(fresh)
@@ -248,13 +248,15 @@ def _fresh_seed(config: FinetuneConfig, use: int = 0) -> int:
 
 def _self_train(
     checkpoint: Checkpoint,
+    base: Trial,
     chosen: Trial,
     scores: Scores,
     config: FinetuneConfig,
     extra: int,
     progress: Progress | None,
 ) -> Trial | None:
-    """Imitate the chosen policy's own liked rollouts, made with less noise than it has itself.
+    """Imitate the chosen policy's own liked rollouts near the data, made with less noise than it
+    has itself.
 
     Most failures begin where the policy wavers between two ways round an obstacle. With less noise
     it wavers less and still takes many ways, and imitation makes that its own. Its scale is 1: the
@@ -265,7 +267,7 @@ def _self_train(
     steady = rollout(
         replace(checkpoint, policy=chosen.policy), settings, noise_scale=guiding.self_training_noise
     )
-    liked = _liked(steady, scores)
+    liked = _near_data(checkpoint, _liked(steady, scores), base.off_support)
     if not liked:
         return None
     lessons = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
@@ -275,6 +277,20 @@ def _self_train(
         config.seed + extra + 1, _stage(progress, f"self-training {extra + 1}"),
     )  # fmt: skip
     return _try(checkpoint, policy, chosen.scale, scores, config)
+
+
+def _near_data(
+    checkpoint: Checkpoint, trajectories: Sequence[Trajectory], limit: float
+) -> list[Trajectory]:
+    """Those that leave the data no more than `limit`, but at least the nearer half of them all.
+
+    Without this a narrow way beside the demonstrations could become the policy's favourite.
+    """
+    policy, support = checkpoint.policy, checkpoint.support
+    off = [off_support_share([one], policy.normaliser, support) for one in trajectories]
+    order = np.argsort(off, kind="stable")
+    count = max(sum(share <= limit for share in off), (len(off) + 1) // 2)
+    return [trajectories[i] for i in sorted(order[:count].tolist())]
 
 
 def _tell(progress: Progress | None, stage: str, fraction: float, trial: Trial) -> None:

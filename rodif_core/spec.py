@@ -105,7 +105,7 @@ class GuideConfig(_JsonConfig):
     require_success: bool = True  # keep only trajectories that the simulation calls successful
     self_training_rounds: int = 2  # passes that imitate the policy's own liked cautious rollouts
     self_training_rollouts: int = 200  # of each pass
-    self_training_noise: float = 0.6  # of those rollouts, in units of the sampler's own noise
+    self_training_noise: float = 0.8  # of those rollouts, in units of the sampler's own noise
     self_training_updates: int = 400
 
     def __post_init__(self) -> None:
