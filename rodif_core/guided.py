@@ -267,7 +267,7 @@ def _self_train(
     steady = rollout(
         replace(checkpoint, policy=chosen.policy), settings, noise_scale=guiding.self_training_noise
     )
-    liked = _near_data(checkpoint, _liked(steady, scores), base.off_support)
+    liked = near_data(checkpoint, _liked(steady, scores), base.off_support)
     if not liked:
         return None
     lessons = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
@@ -279,7 +279,7 @@ def _self_train(
     return _try(checkpoint, policy, chosen.scale, scores, config)
 
 
-def _near_data(
+def near_data(
     checkpoint: Checkpoint, trajectories: Sequence[Trajectory], limit: float
 ) -> list[Trajectory]:
     """Those that leave the data no more than `limit`, but at least the nearer half of them all.

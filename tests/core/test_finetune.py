@@ -11,10 +11,11 @@ import torch
 
 from rodif_core.contrast import contrast
 from rodif_core.diffusion.chain import add_noise
+from rodif_core.drift import SupportSet
 from rodif_core.errors import LearningError
 from rodif_core.finetune import finetune
 from rodif_core.guidance import guidance_target, guide
-from rodif_core.guided import Trial, choose, improves
+from rodif_core.guided import Trial, choose, improves, near_data
 from rodif_core.log_ratio import PairMatrix, Transitions
 from rodif_core.preferences.pairs import Preference
 from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
@@ -210,3 +211,20 @@ def test_self_training_is_believed_unless_it_is_clearly_worse() -> None:
     assert improves(base, before, trial(1.0, 0.94, 0.02, 0.94))
     assert not improves(base, before, trial(1.0, 0.85, 0.02, 0.85))
     assert not improves(base, before, trial(1.0, 0.99, 0.2, 0.99))
+
+
+def test_self_training_leaves_out_what_strays_but_keeps_the_nearer_half() -> None:
+    policy = tiny_policy()
+    home = policy.normaliser.observation(torch.zeros(1, 4))
+    checkpoint = replace(tiny_checkpoint(), support=SupportSet(home, 0.1))
+    near = chain_trajectory(policy, 3, seed=0)  # all its made-up observations are 0
+    shares = [0.0, 0.5, 0.25, 1.0]
+    mixed = []
+    for share in shares:
+        observations = near.observations.copy()
+        observations[: round(share * len(observations))] = 9.0
+        mixed.append(replace(near, observations=observations))
+    assert near_data(checkpoint, mixed, limit=0.3) == [mixed[0], mixed[2]]
+    assert near_data(checkpoint, mixed, limit=0.6) == mixed[:3]
+    assert near_data(checkpoint, mixed[1:], limit=0.0) == mixed[1:3]  # the nearer half of three
+    assert near_data(checkpoint, [], limit=0.3) == []
