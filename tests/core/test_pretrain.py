@@ -13,12 +13,13 @@ from rodif_core import pretrain as module
 from rodif_core.demonstrations import make_demonstrations
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import PolicyConfig
+from rodif_core.policies.unet import UnetSize
 from rodif_core.pretrain import PretrainConfig, Windows, pretrain
 from rodif_core.spec import TaskName
 from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
 
-CONFIG = PretrainConfig(channels=(8, 16), updates=30, batch_size=32, warm_up=5)
+CONFIG = PretrainConfig(size=UnetSize((8, 16)), updates=30, batch_size=32, warm_up=5)
 
 
 @pytest.fixture(scope="module")
