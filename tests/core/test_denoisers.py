@@ -23,7 +23,7 @@ from rodif_core.log_ratio import (
     preference_loss,
 )
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
-from rodif_core.policies.policy import DiffusionPolicy, build_denoiser
+from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.policies.unet import UnetSize
 from rodif_core.preferences.pairs import Preference
 from rodif_core.rollout import rollout
@@ -49,6 +49,16 @@ def inputs(
         torch.randint(1, size.denoising_steps + 1, (rows,), generator=generator),
         torch.randn(rows, size.observation_steps, size.observation_dim, generator=generator),
     )
+
+
+def trainable_policy(architecture: Architecture) -> DiffusionPolicy:
+    """`tiny_policy`, but for a U-Net with two channels a group: with one, normalisation hides
+    what is constant along the chunk."""
+    policy = tiny_policy(architecture=architecture)
+    if architecture is not Architecture.UNET:
+        return policy
+    config = replace(policy.config, size=UnetSize(channels=(16, 32), step_dim=8))
+    return DiffusionPolicy.build(config, policy.normaliser)
 
 
 def moved_copy(policy: DiffusionPolicy) -> DiffusionPolicy:
@@ -99,18 +109,18 @@ def test_order_in_chunk_and_history_matters(architecture: Architecture) -> None:
 
 
 def test_gradient_flows_into_every_parameter(architecture: Architecture) -> None:
-    policy = tiny_policy(architecture=architecture)
-    size = policy.config.size
-    if isinstance(size, UnetSize):
-        # With one channel a group, normalisation hides the bias before it.
-        size = UnetSize(channels=(16, 32), step_dim=8)
+    policy = trainable_policy(architecture)
     # In double precision a gradient that is only rounding stays below 1e-12.
-    denoiser = build_denoiser(replace(policy.config, size=size)).double()
+    denoiser = policy.denoiser.double()
     noisy, k, histories = inputs(policy, 16)
     noise = denoiser(noisy.double(), k, histories.double())
     (noise - noisy.double().roll(1, 0)).pow(2).sum().backward()
-    dead = [n for n, v in denoiser.named_parameters() if float(v.grad.abs().max()) < 1e-9]
-    assert dead == []
+    # Output by output: the bias of a key in an attention, say, is dead beside that of a value.
+    weakest = {
+        name: float(value.grad.abs().reshape(len(value), -1).amax(1).min())
+        for name, value in denoiser.named_parameters()
+    }
+    assert {name: value for name, value in weakest.items() if value < 1e-9} == {}
 
 
 def test_same_seed_builds_the_same_weights(architecture: Architecture) -> None:
@@ -127,7 +137,9 @@ def test_row_does_not_depend_on_the_other_rows(architecture: Architecture) -> No
         other[3] = mine[3]
     together = policy.denoiser(*one)
     assert torch.equal(policy.denoiser(*two)[3], together[3])
-    assert torch.allclose(policy.denoiser(*(value[3:4] for value in one))[0], together[3], atol=1e-5)
+    assert torch.allclose(
+        policy.denoiser(*(value[3:4] for value in one))[0], together[3], atol=1e-5
+    )
 
 
 def test_training_mode_changes_nothing(architecture: Architecture) -> None:
@@ -277,29 +289,38 @@ def test_guidance_approaches_its_target(architecture: Architecture) -> None:
 def test_learns_a_synthetic_task_far_better_than_guessing_zero(
     architecture: Architecture,
 ) -> None:
-    # The chunk is a function of the last observation, so that the noise can be told apart from it.
-    policy = tiny_policy(architecture=architecture)
+    # The chunk is a function of the last observation, so that noise can be told apart from it.
+    policy = trainable_policy(architecture)
     size, generator = policy.config, torch.Generator().manual_seed(3)
-    mixing = torch.randn(size.observation_dim, size.predicted_steps * 2, generator=generator)
+    mixing = torch.randn(size.observation_dim, 2, generator=generator)
+    ramp = torch.linspace(1, 0.5, size.predicted_steps)[:, None]
 
-    def batch(rows: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    def batch(rows: int) -> tuple[torch.Tensor, torch.Tensor]:
         histories = torch.randn(
             rows, size.observation_steps, size.observation_dim, generator=generator
         )
-        chunks = torch.tanh(histories[:, -1] @ mixing / 2).view(rows, size.predicted_steps, 2)
+        return histories, torch.tanh(histories[:, -1:] @ mixing / 2) * ramp
+
+    def loss(rows: int) -> torch.Tensor:
+        histories, chunks = batch(rows)
         k = torch.randint(1, size.denoising_steps + 1, (rows,), generator=generator)
         noise = torch.randn(chunks.shape, generator=generator)
-        return add_noise(policy.schedule, chunks, noise, k), k, histories, noise
+        noisy = add_noise(policy.schedule, chunks, noise, k)
+        return F.mse_loss(policy.denoiser(noisy, k, histories), noise)
 
     optimizer = torch.optim.Adam(policy.denoiser.parameters(), lr=5e-3)
     for _ in range(300):
-        noisy, k, histories, noise = batch(128)
         optimizer.zero_grad(set_to_none=True)
-        F.mse_loss(policy.denoiser(noisy, k, histories), noise).backward()
+        loss(128).backward()
         optimizer.step()
-    noisy, k, histories, noise = batch(1000)
-    loss = F.mse_loss(policy.denoiser(noisy, k, histories).detach(), noise)
-    assert float(loss) < 0.35 * float(noise.pow(2).mean())
+    with torch.no_grad():
+        # The zero predictor's loss is the noise's variance, 1.
+        assert float(loss(1000)) < 0.1
+        histories, chunks = batch(500)
+        noise = torch.randn(500, size.denoising_steps, *chunks.shape[1:], generator=generator)
+        made = sample_chain(policy.denoiser, policy.schedule, histories, noise)[:, -1]
+        # The loss alone would let through who guesses the mean action, and so errs by the variance.
+        assert float(F.mse_loss(made, chunks)) < 0.3 * float(chunks.var())
 
 
 def test_rollouts_of_every_denoiser_can_be_finetuned(architecture: Architecture) -> None:
