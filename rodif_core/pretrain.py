@@ -111,7 +111,13 @@ PRESETS = {
     },
     Architecture.TRANSFORMER: {
         "cpu": _TRANSFORMER,
-        "paper": replace(_TRANSFORMER, size=TransformerSize(512, 8, 4, 7, 3200), **_PAPER),
+        "paper": replace(
+            _TRANSFORMER,
+            size=TransformerSize(
+                width=512, heads=8, encoder_layers=4, decoder_layers=7, feedforward=3200
+            ),
+            **_PAPER,
+        ),
     },
     Architecture.MLP: {
         "cpu": _MLP,

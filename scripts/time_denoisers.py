@@ -64,14 +64,14 @@ def main() -> int:
             k = torch.randint(1, size.denoising_steps + 1, (args.batch,))
             histories = torch.randn(args.batch, size.observation_steps, OBSERVATION_DIM)
             cells = time_module(build_denoiser(size), (noisy, k, histories), args.repeat)
-            print(f"| `{architecture}` | `{name}` | {cells} |", flush=True)
+            sys.stdout.write(f"| `{architecture}` | `{name}` | {cells} |\n")
     for name in args.presets:
         config = ENCODERS[name]
         shape = (args.batch, 1, config.cameras, config.pixels, config.pixels, 3)
         frames = torch.randint(0, 256, shape, dtype=torch.uint8)
         rows = torch.randn(args.batch, 1, PROPRIOCEPTION_DIM), frames
         cells = time_module(ImageEncoder(config), rows, args.repeat)
-        print(f"| two cameras | `{name}` | {cells} |", flush=True)
+        sys.stdout.write(f"| two cameras | `{name}` | {cells} |\n")
     return 0
 
 

@@ -102,7 +102,8 @@ class PolicyConfig:
         size = ARCHITECTURES[parse_name(Architecture, name, "architecture")]
         images = rest.pop("images", None)
         sizes = {item.name: rest.pop(item.name) for item in fields(size) if item.name in rest}
-        legal = [item.name for item in fields(cls)] + [item.name for item in fields(size)]
+        own = [item.name for item in fields(cls) if item.name != "size"]
+        legal = ["architecture", *own, *(item.name for item in fields(size))]
         for key in rest:
             if key not in legal:
                 raise UnknownNameError(f"{name} policy field", key, legal)
