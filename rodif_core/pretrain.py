@@ -76,8 +76,14 @@ class PretrainConfig:
         )
 
 
-# The architecture of each task (paper, Table 1).
-TASK_ARCHITECTURES = {TaskName.AVOID: Architecture.UNET}
+# The architecture of each task, by name (paper, Table 1).
+TASK_ARCHITECTURES: dict[str, Architecture] = {
+    "avoid": Architecture.UNET,
+    "pushing": Architecture.UNET,
+    "sorting": Architecture.TRANSFORMER,
+    "aligning": Architecture.MLP,
+    "stacking": Architecture.TRANSFORMER,
+}
 
 # To, Tp and K are the paper's (appendix, architectures and training hyperparameters); Te is ours
 # but for the single action. Where the sizes come from is told in docs/architectures.md.

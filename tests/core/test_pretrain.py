@@ -130,7 +130,7 @@ def test_presets_have_the_documented_number_of_weights(
 
 
 def test_every_task_has_an_architecture_and_avoid_keeps_its_training() -> None:
-    assert set(TASK_ARCHITECTURES) == set(TaskName)
+    assert set(TaskName) <= set(TASK_ARCHITECTURES)
     config = preset_for(TaskName.AVOID, "cpu")
     assert config.size == UnetSize(channels=(16, 32, 64), step_dim=32)
     assert (config.updates, config.batch_size, config.learning_rate) == (10_000, 128, 1e-3)
