@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -74,4 +75,4 @@ def guide(
                 mean.lerp_(current, 1 - config.ema_decay)
         if progress is not None and (update % REPORT_EVERY == 0 or update == config.updates - 1):
             progress(update + 1, config.updates, {"loss": value})
-    return DiffusionPolicy(policy.config, average, policy.schedule, policy.normaliser)
+    return replace(policy, denoiser=average)

@@ -23,6 +23,14 @@ class TaskName(StrEnum):
     AVOID = "avoid"
 
 
+class Architecture(StrEnum):
+    """Denoising networks of the paper."""
+
+    UNET = "unet"  # convolutions over the action chunk (Avoid, Pushing)
+    TRANSFORMER = "transformer"  # action chunks over an observation history (Sorting, Stacking)
+    MLP = "mlp"  # single actions (Aligning)
+
+
 class FinetuneMethod(StrEnum):
     """Fine-tuners that turn labels into a candidate policy."""
 

@@ -24,6 +24,7 @@ from rodif_core.spec import TaskName, parse_name
 
 FORMAT = "rodif-checkpoint-1"
 _WEIGHTS = "denoiser."
+_ENCODER = "encoder."  # only in policies that see images
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +103,23 @@ def shipped_checkpoint(task: TaskName) -> bytes:
 
 
 def _tensors(checkpoint: Checkpoint) -> dict[str, Tensor]:
-    weights = {
-        _WEIGHTS + name: value.detach().cpu().contiguous()
-        for name, value in checkpoint.policy.denoiser.state_dict().items()
+    policy = checkpoint.policy
+    tensors = policy.normaliser.tensors() | {"support.points": checkpoint.support.points}
+    for name, value in policy.denoiser.state_dict().items():
+        tensors[_WEIGHTS + name] = value
+    if policy.encoder is not None:
+        for name, value in policy.encoder.state_dict().items():
+            tensors[_ENCODER + name] = value
+    return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors of one module, by their names in it."""
+    return {
+        name.removeprefix(prefix): value
+        for name, value in tensors.items()
+        if name.startswith(prefix)
     }
-    rest = checkpoint.policy.normaliser.tensors() | {"support.points": checkpoint.support.points}
-    return weights | {name: value.detach().cpu().contiguous() for name, value in rest.items()}
 
 
 def _rebuild(tensors: dict[str, Tensor], header: dict[str, Any]) -> Checkpoint:
@@ -115,16 +127,13 @@ def _rebuild(tensors: dict[str, Tensor], header: dict[str, Any]) -> Checkpoint:
         raise CheckpointFileError(
             f"checkpoint has format {header.get('format')!r}; this version reads {FORMAT!r}"
         )
-    config = PolicyConfig(**json.loads(header["config"]))
+    config = PolicyConfig.from_json(json.loads(header["config"]))
     # The weights come from the file; drawing fresh ones must not disturb the caller's randomness.
     with torch.random.fork_rng(devices=[]):
         policy = DiffusionPolicy.build(config, Normaliser.from_tensors(tensors))
-    weights = {
-        name.removeprefix(_WEIGHTS): value
-        for name, value in tensors.items()
-        if name.startswith(_WEIGHTS)
-    }
-    policy.denoiser.load_state_dict(weights, strict=True)
+    policy.denoiser.load_state_dict(_part(tensors, _WEIGHTS), strict=True)
+    if policy.encoder is not None:
+        policy.encoder.load_state_dict(_part(tensors, _ENCODER), strict=True)
     support = SupportSet(tensors["support.points"], float(header["support_threshold"]))
     task = parse_name(TaskName, header["task"], "task")
     return Checkpoint(task, policy, support, json.loads(header["card"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,6 +36,12 @@ class Normaliser:
         observation = centre_and_scale(np.concatenate(observations))
         action = centre_and_scale(np.concatenate(actions))
         return cls(*observation, *action)
+
+    def with_features(self, count: int) -> Normaliser:
+        """The same, for observations followed by `count` image features, which stay as they are."""
+        centre = torch.cat([self.observation_centre, torch.zeros(count)])
+        scale = torch.cat([self.observation_scale, torch.ones(count)])
+        return replace(self, observation_centre=centre, observation_scale=scale)
 
     def observation(self, values: Tensor) -> Tensor:
         """(…, O) task units → normalised."""

@@ -6,23 +6,41 @@ import numpy as np
 import torch
 
 from rodif_core.policies.checkpoint import Checkpoint, SupportSet
+from rodif_core.policies.mlp import MlpSize
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig
-from rodif_core.spec import TaskName
+from rodif_core.policies.transformer import TransformerSize
+from rodif_core.policies.unet import UnetSize
+from rodif_core.spec import Architecture, TaskName
 from rodif_core.trajectory import Trajectory
 
+TINY_SIZES = {
+    Architecture.UNET: UnetSize(channels=(8, 16), step_dim=8),
+    Architecture.TRANSFORMER: TransformerSize(16, 2, 1, 2, 24),
+    Architecture.MLP: MlpSize(width=24, blocks=2, step_dim=8),
+}
+TINY_HISTORIES = {Architecture.UNET: 2, Architecture.TRANSFORMER: 3, Architecture.MLP: 1}
 
-def tiny_policy(seed: int = 0, *, std_floor: float = 0.0, steps: int = 5) -> DiffusionPolicy:
-    """Avoid's dims, an 8-channel U-Net, K = `steps`."""
+
+def tiny_policy(
+    seed: int = 0,
+    *,
+    std_floor: float = 0.0,
+    steps: int = 5,
+    architecture: Architecture = Architecture.UNET,
+) -> DiffusionPolicy:
+    """Avoid's dims, a network of some ten thousand weights or fewer, K = `steps`; the MLP acts
+    one step at a time."""
     torch.manual_seed(seed)
+    single = architecture is Architecture.MLP
     config = PolicyConfig(
         observation_dim=4,
         action_dim=2,
-        predicted_steps=8,
-        executed_steps=4,
+        observation_steps=TINY_HISTORIES[architecture],
+        predicted_steps=1 if single else 8,
+        executed_steps=1 if single else 4,
         denoising_steps=steps,
-        channels=(8, 16),
-        step_dim=8,
+        size=TINY_SIZES[architecture],
         std_floor=std_floor,
     )
     normaliser = Normaliser(
@@ -32,10 +50,11 @@ def tiny_policy(seed: int = 0, *, std_floor: float = 0.0, steps: int = 5) -> Dif
     return DiffusionPolicy.build(config, normaliser)
 
 
-def tiny_checkpoint(seed: int = 0) -> Checkpoint:
+def tiny_checkpoint(seed: int = 0, *, architecture: Architecture = Architecture.UNET) -> Checkpoint:
     """A checkpoint around `tiny_policy`."""
+    policy = tiny_policy(seed, architecture=architecture)
     support = SupportSet(torch.zeros(3, 4), 0.1)
-    return Checkpoint(TaskName.AVOID, tiny_policy(seed), support, {"kind": "test"})
+    return Checkpoint(TaskName.AVOID, policy, support, {"kind": "test"})
 
 
 def chain_trajectory(
@@ -44,7 +63,7 @@ def chain_trajectory(
     """An episode whose chains the policy itself sampled, at made-up observations around `x`."""
     generator = torch.Generator().manual_seed(seed)
     size = policy.config
-    histories = torch.randn(decisions, 2, 4, generator=generator) * 0.05
+    histories = torch.randn(decisions, size.observation_steps, 4, generator=generator) * 0.05
     histories = histories + torch.tensor([x, 0.0, x, 0.0])
     noise = torch.randn(
         decisions, size.denoising_steps + 1, size.predicted_steps, 2, generator=generator

@@ -11,14 +11,24 @@ import torch
 
 from rodif_core import pretrain as module
 from rodif_core.demonstrations import make_demonstrations
+from rodif_core.errors import UnknownNameError
 from rodif_core.policies.normaliser import Normaliser
-from rodif_core.policies.policy import PolicyConfig
-from rodif_core.pretrain import PretrainConfig, Windows, pretrain
-from rodif_core.spec import TaskName
+from rodif_core.policies.policy import PolicyConfig, build_denoiser
+from rodif_core.policies.unet import UnetSize
+from rodif_core.pretrain import (
+    PRESETS,
+    TASK_ARCHITECTURES,
+    PretrainConfig,
+    Windows,
+    preset_for,
+    pretrain,
+)
+from rodif_core.spec import Architecture, TaskName
 from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
+from tests.core.learning import TINY_SIZES
 
-CONFIG = PretrainConfig(channels=(8, 16), updates=30, batch_size=32, warm_up=5)
+CONFIG = PretrainConfig(size=UnetSize((8, 16)), updates=30, batch_size=32, warm_up=5)
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +60,83 @@ def test_normaliser_maps_extremes_to_one_and_back(demonstrations: list[Trajector
     assert np.allclose(normaliser.to_task_action(scaled).numpy(), actions, atol=1e-7)
 
 
-def test_held_out_loss_falls_when_it_trains(demonstrations: list[Trajectory]) -> None:
-    config = replace(CONFIG, updates=200)
-    curve = pretrain(TaskName.AVOID, demonstrations, config).card["held_out_curve"]
+@pytest.mark.parametrize("architecture", list(Architecture))
+def test_held_out_loss_falls_when_it_trains(
+    demonstrations: list[Trajectory], architecture: Architecture
+) -> None:
+    shape = PRESETS[architecture]["cpu"]
+    config = replace(
+        shape, size=TINY_SIZES[architecture], updates=200, batch_size=32, warm_up=5,
+        learning_rate=3e-3,
+    )  # fmt: skip
+    checkpoint = pretrain(TaskName.AVOID, demonstrations, config)
+    curve = checkpoint.card["held_out_curve"]
     assert curve[-1]["held_out"] < 0.7 * curve[0]["held_out"]
+    assert checkpoint.card["architecture"] == architecture
+    size = checkpoint.policy.config
+    assert size == config.policy_config(4, 2)
+    actions, _ = checkpoint.policy.act(
+        torch.zeros(1, size.observation_steps, 4),
+        torch.zeros(1, size.denoising_steps, size.predicted_steps, 2),
+    )
+    assert actions.shape == (1, size.executed_steps, 2)
+
+
+@pytest.mark.parametrize("name", ["cpu", "paper"])
+@pytest.mark.parametrize(
+    ("architecture", "shape"),
+    # The paper's appendix: T_obs, T_pred, K; the single action leaves no choice of T_exec.
+    [
+        (Architecture.UNET, (2, 16, 8, 20)),
+        (Architecture.TRANSFORMER, (5, 16, 8, 16)),
+        (Architecture.MLP, (1, 1, 1, 4)),
+    ],
+)
+def test_presets_have_the_shapes_of_the_paper(
+    architecture: Architecture, name: str, shape: tuple[int, ...]
+) -> None:
+    config = PRESETS[architecture][name].policy_config(10, 2)
+    assert config.architecture is architecture
+    assert shape == (
+        config.observation_steps,
+        config.predicted_steps,
+        config.executed_steps,
+        config.denoising_steps,
+    )
+
+
+@pytest.mark.parametrize(
+    ("architecture", "name", "weights"),
+    # With 10 observation and 2 action dims, as in Pushing and Sorting.
+    [
+        (Architecture.UNET, "cpu", 165_810),
+        (Architecture.UNET, "paper", 34_169_250),
+        (Architecture.TRANSFORMER, "cpu", 400_130),
+        (Architecture.TRANSFORMER, "paper", 57_110_402),
+        (Architecture.MLP, "cpu", 114_210),
+        (Architecture.MLP, "paper", 548_770),
+    ],
+)
+def test_presets_have_the_documented_number_of_weights(
+    architecture: Architecture, name: str, weights: int
+) -> None:
+    with torch.device("meta"):  # shapes without memory
+        denoiser = build_denoiser(PRESETS[architecture][name].policy_config(10, 2))
+    assert sum(value.numel() for value in denoiser.parameters()) == weights
+    text = (Path(__file__).parents[2] / "docs" / "architectures.md").read_text()
+    assert f"| `{architecture}` | `{name}` |" in text
+    row = next(line for line in text.splitlines() if f"| `{architecture}` | `{name}` |" in line)
+    assert f"| {weights:,} |" in row
+
+
+def test_every_task_has_an_architecture_and_avoid_keeps_its_training() -> None:
+    assert set(TaskName) <= set(TASK_ARCHITECTURES)
+    config = preset_for(TaskName.AVOID, "cpu")
+    assert config.size == UnetSize(channels=(16, 32, 64), step_dim=32)
+    assert (config.updates, config.batch_size, config.learning_rate) == (10_000, 128, 1e-3)
+    assert (config.weight_decay, config.warm_up, config.ema_decay) == (1e-6, 200, 0.999)
+    with pytest.raises(UnknownNameError, match="unknown preset 'gpu'.*'cpu', 'paper'"):
+        preset_for(TaskName.AVOID, "gpu")
 
 
 def test_killed_pretraining_goes_on_to_the_same_weights(

@@ -9,7 +9,7 @@ from pathlib import Path
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
 
-PRESET_NAMES = ("cpu", "paper")  # rodif_core.pretrain.PRESETS, not imported for the help's sake
+PRESET_NAMES = ("cpu", "paper")  # of rodif_core.pretrain, which the help does not load
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -44,16 +44,16 @@ def run(args: argparse.Namespace) -> int:
     from rodif_core.demonstrations import DEFAULT_LEFT_SHARE, make_demonstrations
     from rodif_core.evaluate import evaluate
     from rodif_core.policies.checkpoint import save_checkpoint
-    from rodif_core.pretrain import PRESETS, pretrain
+    from rodif_core.pretrain import preset_for, pretrain
     from rodif_core.tasks import get_task
     from worker.cli.tables import evaluation_table
 
-    config = replace(PRESETS[args.preset], seed=args.seed)
+    task_name = TaskName(args.task)
+    config = replace(preset_for(task_name, args.preset), seed=args.seed)
     if args.updates is not None:
         config = replace(config, updates=args.updates)
     if args.workspace is not None:
         args.workspace.mkdir(parents=True, exist_ok=True)
-    task_name = TaskName(args.task)
     console = Console(stderr=True)
     with Progress(console=console) as bar:
         making = bar.add_task("demonstrations", total=args.demonstrations)
