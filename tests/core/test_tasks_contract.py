@@ -253,4 +253,4 @@ def test_an_unknown_task_is_refused_with_the_legal_names(task: Task) -> None:
 
 def test_an_unknown_reason_is_refused(task: Task) -> None:
     with pytest.raises(UnknownNameError, match=f"'tired'.*'{REASONS[0]}'"):
-        task.outcome(np.zeros((1, 3)), "tired")
+        task.outcome(np.zeros((1, 3)), np.zeros((1, len(task.objects), 7)), "tired")
