@@ -64,6 +64,7 @@ class Task(ABC):
     modes: ClassVar[tuple[str, ...]]  # codes of all ways to succeed
     groups: ClassVar[tuple[str, ...]]  # coarse modes that annotators can prefer
     preferred_group: ClassVar[str]
+    preferred_share: ClassVar[float] = 0.2  # of the preferred group in scripted demonstrations
     criterion: ClassVar[str]  # what annotators are asked
 
     @abstractmethod

@@ -29,6 +29,7 @@ ARM_JOINTS = 7
 TOOL_BODY = "panda0_link7"
 TOOL_SITE = "rod_tip"  # the end effector of every task with a rod
 ROD_GEOM = "rod"
+TABLE_GEOM = "table"
 CONTACT_SENSOR = "rod_contact"
 ROD_RADIUS = 0.01  # m, as D3IL
 ROD_TIP = 0.30  # m from the tool body along its axis
@@ -175,7 +176,7 @@ def _add_servos(spec: mujoco.MjSpec) -> None:
 
 def _add_table(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_geom(
-        name="table",
+        name=TABLE_GEOM,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=[0.35, 0.0, -0.02],
         size=[0.60, 0.60, 0.02],

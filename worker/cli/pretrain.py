@@ -20,7 +20,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--preset", choices=PRESET_NAMES, default="cpu")
     parser.add_argument("--demonstrations", type=int, default=2000)
     parser.add_argument(
-        "--left-share", type=float, help="share of demonstrations on the left (default: the task's)"
+        "--preferred-share",
+        "--left-share",
+        type=float,
+        help="share of demonstrations in the preferred group, for avoid: on the left"
+        " (default: the task's)",
     )
     parser.add_argument("--updates", type=int, help="default: the preset's")
     parser.add_argument("--seed", type=int, default=0)
@@ -41,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from rodif_core.demonstrations import DEFAULT_LEFT_SHARE, make_demonstrations
+    from rodif_core.demonstrations import make_demonstrations
     from rodif_core.evaluate import evaluate
     from rodif_core.policies.checkpoint import save_checkpoint
     from rodif_core.pretrain import PRESETS, pretrain
@@ -61,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
             get_task(task_name),
             episodes=args.demonstrations,
             seed=args.seed,
-            left_share=DEFAULT_LEFT_SHARE if args.left_share is None else args.left_share,
+            preferred_share=args.preferred_share,
             progress=lambda done, _: bar.update(making, completed=done),
         )
         training = bar.add_task("training", total=config.updates)

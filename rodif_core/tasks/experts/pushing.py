@@ -1,0 +1,47 @@
+"""A scripted demonstrator for Pushing: reacts to the observation alone, given its mode."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rodif_core.errors import UnknownNameError
+from rodif_core.tasks.base import Array, Context
+from rodif_core.tasks.experts import push
+from rodif_core.tasks.pushing import MODES, TARGETS
+
+PLACED = 0.018  # m from its target: the expert turns to the other cube
+
+
+@dataclass(frozen=True)
+class PushingExpert:
+    """Pushes one cube to one target and then the other cube to the other."""
+
+    mode: str
+    tremble: ClassVar[float] = 0.0008  # m per control step: standard deviation of the hand's noise
+
+    @classmethod
+    def draw(cls, mode: str, context: Context, rng: np.random.Generator) -> PushingExpert:
+        """The expert of that mode; raises UnknownNameError for one that the task has not."""
+        if mode not in MODES:
+            raise UnknownNameError("mode", mode, MODES)
+        return cls(mode)
+
+    def act(self, observation: NDArray[np.float32]) -> Array:
+        """The steady hand's action (2,) in metres for an observation (20,)."""
+        values = [float(value) for value in observation[:12]]
+        rod = values[2], values[3]
+        cubes = (values[4], values[5]), (values[8], values[9])
+        first, second = MODES[self.mode]
+        cube, target = first
+        if math.dist(cubes[cube], TARGETS[target]) < PLACED:
+            cube, target = second
+        return np.array(push.steer(rod, cubes[cube], TARGETS[target], cubes[1 - cube]))
+
+    def to_json(self) -> dict[str, Any]:
+        """The parameters, for the record of a demonstration."""
+        return {"mode": self.mode, "tremble": self.tremble}
