@@ -154,7 +154,7 @@ def push_frame(ends: Array, cubes: Array, targets: Array) -> Array:
     return np.asarray(np.tanh(np.stack([along, across], axis=1) / NEAR))
 
 
-def square_shape(
+def target_shape(
     name: str, centre: tuple[float, float], half: tuple[float, float], colour: str
 ) -> dict[str, Any]:
     """A target for top-down plots: an outlined rectangle."""

@@ -154,7 +154,7 @@ class PushingTask(Task):
         middle = (sum(CUBE_Y)) / 2
         return [
             *(
-                blocks.square_shape(name, target, half, colours[name])
+                blocks.target_shape(name, target, half, colours[name])
                 for name, target in zip(self.objects, TARGETS, strict=True)
             ),
             *(

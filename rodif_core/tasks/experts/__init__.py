@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from rodif_core.spec import TaskName
 from rodif_core.tasks.base import Array, Context
 from rodif_core.tasks.experts.avoid import AvoidExpert
 from rodif_core.tasks.experts.pushing import PushingExpert
+from rodif_core.tasks.experts.sorting import SortingExpert
 
 
 class Expert(Protocol):
@@ -37,9 +39,12 @@ class Expert(Protocol):
 
 def draw_expert(task: TaskName, mode: str, context: Context, rng: np.random.Generator) -> Expert:
     """An expert for one episode; raises UnknownNameError for a mode that the task has not."""
-    if task is TaskName.AVOID:
-        return AvoidExpert.draw(mode, context, rng)
-    return PushingExpert.draw(mode, context, rng)
+    experts: dict[TaskName, Callable[..., Expert]] = {
+        TaskName.AVOID: AvoidExpert.draw,
+        TaskName.PUSHING: PushingExpert.draw,
+        TaskName.SORTING: SortingExpert.draw,
+    }
+    return experts[task](mode, context, rng)
 
 
 __all__ = ["Expert", "draw_expert"]
