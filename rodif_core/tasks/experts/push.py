@@ -23,6 +23,7 @@ KEEP_OUT = 0.075  # m; the rod goes round a cube's centre at this distance: half
 KEEP_OUT_EDGE = 0.035  # m; the way round begins to bend this far outside KEEP_OUT
 FREE_ANGLE, ROUND_ANGLE = 0.55, 0.95  # rad behind the cube: no way round below, in full above
 DETOUR = 0.105  # m; a pushed cube passes the other one's centre at this distance
+SQUEEZE = (0.07, 0.11)  # m from the place behind the cube: nearer, the other cube is not avoided
 FREE_SPEED = 0.0105  # m per control step
 PUSH_SPEED = 0.0070
 SLOW_BEFORE = 0.04  # m before the target the push slows down, to SLOWEST of its speed
@@ -46,7 +47,9 @@ def steer(rod: Point, cube: Point, target: Point, other: Point) -> Point:
     off = ramp(angle, FREE_ANGLE, ROUND_ANGLE)
     vx, vy = go_round(vx, vy, rx, ry, off, turn=1.0 if across > 0 else -1.0)
     ox, oy = rod[0] - other[0], rod[1] - other[1]
-    vx, vy = go_round(vx, vy, ox, oy, 1.0, turn=None)
+    # Where the other cube leaves no room behind this one, the rod shoves it aside.
+    squeeze = math.hypot(along + BEHIND, across)
+    vx, vy = go_round(vx, vy, ox, oy, ramp(squeeze, *SQUEEZE), turn=None)
 
     push = PUSH_SPEED * max(SLOWEST, min(1.0, left / SLOW_BEFORE))
     speed = push + (FREE_SPEED - push) * max(ramp(distance, 0.085, 0.14), off)
