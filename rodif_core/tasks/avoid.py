@@ -146,7 +146,10 @@ class AvoidTask(Task):
         )
 
     def outcome(
-        self, path: NDArray[np.floating[Any]], objects: NDArray[np.floating[Any]], reason: str
+        self,
+        path: NDArray[np.floating[Any]],
+        objects: NDArray[np.floating[Any]],  # noqa: ARG002 - Avoid has none
+        reason: str,
     ) -> dict[str, Any]:
         if reason not in REASONS:
             raise UnknownNameError("reason", reason, REASONS)

@@ -82,7 +82,7 @@ class Task(ABC):
         Raises ValueOutOfRangeError when the context lacks a value or has one outside its range.
         """
 
-    def start_objects(self, context: Context) -> Array:
+    def start_objects(self, context: Context) -> Array:  # noqa: ARG002 - none by default
         """First poses (B, 7) of the objects; the scene comes to rest from there.
 
         Raises ValueOutOfRangeError as `start_point` does.

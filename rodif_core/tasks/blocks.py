@@ -55,7 +55,9 @@ def draw_start(rng: np.random.Generator, start: tuple[float, float]) -> list[flo
     return [float(point[0]), float(point[1])]
 
 
-def draw_cubes(rng: np.random.Generator, ranges: Sequence[tuple[Range, Range]]) -> list[list[float]]:
+def draw_cubes(
+    rng: np.random.Generator, ranges: Sequence[tuple[Range, Range]]
+) -> list[list[float]]:
     """Starts [x, y, yaw in rad] of cubes, uniform in their ranges of x and y and in +- MAX_YAW;
     drawn again until none touches another (D3IL lets them overlap, and the solver throws them)."""
     while True:
@@ -90,16 +92,16 @@ def read_start(context: Context, height: float, start: tuple[float, float]) -> A
     """The rod's first set-point (3,) from context["start"]: within START_REACH of the task's
     `start`, where no cube can stand. Raises ValueOutOfRangeError."""
     (x, y), r = start, START_REACH
-    legal = f"[x, y] in metres with x in [{x - r:.3f}, {x + r:.3f}], y in [{y - r:.3f}, {y + r:.3f}]"
+    legal = (
+        f"[x, y] in metres with x in [{x - r:.3f}, {x + r:.3f}], y in [{y - r:.3f}, {y + r:.3f}]"
+    )
     point = read_numbers(context, "start", 2, legal)
     if np.abs(point - start).max() > r:
         raise ValueOutOfRangeError("start", context["start"], legal)
     return np.append(point, height)
 
 
-def read_cubes(
-    context: Context, ranges: Mapping[str, tuple[Range, Range]], height: float
-) -> Array:
+def read_cubes(context: Context, ranges: Mapping[str, tuple[Range, Range]], height: float) -> Array:
     """Poses (B, 7) of cubes at `height` from context[name] = [x, y, yaw], in the order of `ranges`.
 
     Raises ValueOutOfRangeError for a place outside the ranges, a yaw outside +- MAX_YAW, or cubes
@@ -169,9 +171,7 @@ def target_shape(
     }
 
 
-def cube_shape(
-    index: int, name: str, place: tuple[float, float], colour: str
-) -> dict[str, Any]:
+def cube_shape(index: int, name: str, place: tuple[float, float], colour: str) -> dict[str, Any]:
     """A movable cube for top-down plots, drawn at `place` where no episode is shown; `index` is
     its place in `Task.objects`."""
     return {

@@ -28,7 +28,6 @@ from rodif_core.tasks.base import (
 from rodif_core.tasks.control import RodKinematics
 from rodif_core.tasks.panda import CONTACT_SENSOR, PHYSICS_STEPS, TOOL_SITE
 
-
 REST_STEPS = 10  # control steps (0.35 s) in which objects come to rest before an episode
 
 

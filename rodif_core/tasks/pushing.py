@@ -1,10 +1,10 @@
 """Pushing: move a red and a green cube onto two targets with the tip of the rod.
 
 Cubes, targets, start ranges, success and the order of visits are those of D3IL's "Pushing" (Jia et
-al., ICLR 2024). Different from D3IL, on purpose: the rod is thicker and grips (see `blocks`), yaw is
-given as sine and cosine of four times the angle instead of its tangent, observations add the rod's
-place in the frame of each of the four possible pushes, they show the state after the step, and
-set-points stay within the arm's reach.
+al., ICLR 2024). Different from D3IL, on purpose: the rod is thicker and grips (see `blocks`), yaw
+is given as sine and cosine of four times the angle instead of its tangent, observations add the
+rod's place in the frame of each of the four possible pushes, they show the state after the step,
+and set-points stay within the arm's reach.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+import rodif_core.tasks.blocks as blocks
 from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
-from rodif_core.tasks import blocks
 from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
 from rodif_core.tasks.panda import CONTROL_DT, ROD_GEOM, TABLE_GEOM, Mesh, add_cube, rod_scene
 
@@ -137,7 +137,10 @@ class PushingTask(Task):
         return np.asarray((view.objects[:, :, 2] > FALLEN).all(axis=1))
 
     def outcome(
-        self, path: NDArray[np.floating[Any]], objects: NDArray[np.floating[Any]], reason: str
+        self,
+        path: NDArray[np.floating[Any]],  # noqa: ARG002 - only the cubes decide
+        objects: NDArray[np.floating[Any]],
+        reason: str,
     ) -> dict[str, Any]:
         if reason not in REASONS:
             raise UnknownNameError("reason", reason, REASONS)

@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+import rodif_core.tasks.blocks as blocks
 from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
-from rodif_core.tasks import blocks
 from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
 from rodif_core.tasks.panda import (
     CONTROL_DT,
@@ -133,7 +133,10 @@ class SortingTask(Task):
         return np.asarray(~lost.any(axis=1))
 
     def outcome(
-        self, path: NDArray[np.floating[Any]], objects: NDArray[np.floating[Any]], reason: str
+        self,
+        path: NDArray[np.floating[Any]],  # noqa: ARG002 - only the cubes decide
+        objects: NDArray[np.floating[Any]],
+        reason: str,
     ) -> dict[str, Any]:
         if reason not in REASONS:
             raise UnknownNameError("reason", reason, REASONS)

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from rodif_core.demonstrations import make_demonstrations
-from rodif_core.policies.checkpoint import load_checkpoint, shipped_checkpoint
+from rodif_core.policies.checkpoint import load_checkpoint
 from rodif_core.rollout import rollout
+from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import RolloutConfig, TaskName
 from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,12 +38,11 @@ class Expert(Protocol):
 
 def draw_expert(task: TaskName, mode: str, context: Context, rng: np.random.Generator) -> Expert:
     """An expert for one episode; raises UnknownNameError for a mode that the task has not."""
-    experts: dict[TaskName, Callable[..., Expert]] = {
-        TaskName.AVOID: AvoidExpert.draw,
-        TaskName.PUSHING: PushingExpert.draw,
-        TaskName.SORTING: SortingExpert.draw,
-    }
-    return experts[task](mode, context, rng)
+    if task is TaskName.AVOID:
+        return AvoidExpert.draw(mode, context, rng)
+    if task is TaskName.PUSHING:
+        return PushingExpert(mode)
+    return SortingExpert(mode)
 
 
 __all__ = ["Expert", "draw_expert"]

@@ -1,9 +1,9 @@
 """How a rod pushes a cube to a target: one smooth field of velocities, without phases.
 
-A rod that first orbits a cube and then, by a switch, pushes it cannot be imitated: beside the switch
-two opposite velocities are both right. Here the rod always heads for one point on the axis of the
-push (the line through target and cube). Far off the axis the point lies behind the cube, on the axis
-it lies ahead of it, and in between it slides along, so that turning in and pushing blend.
+A rod that first orbits a cube and then, by a switch, pushes it cannot be imitated: beside the
+switch two opposite velocities are both right. Here the rod always heads for one point on the axis
+of the push (the line through target and cube). Far off the axis the point lies behind the cube, on
+the axis it lies ahead of it, and in between it slides along, so that turning in and pushing blend.
 
 Legend: all positions are (x, y) in metres, all velocities metres per control step. The push frame
 has its origin in the cube; `along` is towards the target, `across` to the left of that.
@@ -19,7 +19,9 @@ BEHIND = 0.085  # m; where a rod that is off the axis heads for, behind the cube
 AHEAD = 0.10  # m; where a rod on the axis heads for
 AXIS_WIDTH = 0.013  # m off the axis at which the aim has fallen to 1/e of AHEAD, beside the cube
 AXIS_OPENING = 0.25  # how much that widens per metre farther behind than BEHIND
-KEEP_OUT = 0.075  # m; the rod goes round a cube's centre at this distance: half diagonal + rod + 1 cm
+KEEP_OUT = (
+    0.075  # m; the rod goes round a cube's centre at this distance: half diagonal + rod + 1 cm
+)
 KEEP_OUT_EDGE = 0.035  # m; the way round begins to bend this far outside KEEP_OUT
 FREE_ANGLE, ROUND_ANGLE = 0.55, 0.95  # rad behind the cube: no way round below, in full above
 DETOUR = 0.105  # m; a pushed cube passes the other one's centre at this distance
@@ -57,7 +59,7 @@ def steer(rod: Point, cube: Point, target: Point, other: Point) -> Point:
 
 
 def bend(cube: Point, target: Point, other: Point) -> Point:
-    """Direction of the push: towards the target, or past the other cube where that is in the way."""
+    """Direction of the push: to the target, or past the other cube where that is in the way."""
     ux, uy = unit(target[0] - cube[0], target[1] - cube[1])
     ox, oy = other[0] - cube[0], other[1] - cube[1]
     ahead, aside = ox * ux + oy * uy, ux * oy - uy * ox

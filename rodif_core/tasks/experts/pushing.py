@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import UnknownNameError
-from rodif_core.tasks.base import Array, Context
-from rodif_core.tasks.experts import push
+from rodif_core.tasks.base import Array
+from rodif_core.tasks.experts.push import steer
 from rodif_core.tasks.pushing import MODES, TARGETS
 
 PLACED = 0.018  # m from its target: the expert turns to the other cube
@@ -19,17 +19,17 @@ PLACED = 0.018  # m from its target: the expert turns to the other cube
 
 @dataclass(frozen=True)
 class PushingExpert:
-    """Pushes one cube to one target and then the other cube to the other."""
+    """Pushes one cube to one target and then the other cube to the other.
+
+    Raises UnknownNameError for a mode that the task has not.
+    """
 
     mode: str
     tremble: ClassVar[float] = 0.0008  # m per control step: standard deviation of the hand's noise
 
-    @classmethod
-    def draw(cls, mode: str, context: Context, rng: np.random.Generator) -> PushingExpert:
-        """The expert of that mode; raises UnknownNameError for one that the task has not."""
-        if mode not in MODES:
-            raise UnknownNameError("mode", mode, MODES)
-        return cls(mode)
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise UnknownNameError("mode", self.mode, MODES)
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """The steady hand's action (2,) in metres for an observation (20,)."""
@@ -40,7 +40,7 @@ class PushingExpert:
         cube, target = first
         if math.dist(cubes[cube], TARGETS[target]) < PLACED:
             cube, target = second
-        return np.array(push.steer(rod, cubes[cube], TARGETS[target], cubes[1 - cube]))
+        return np.array(steer(rod, cubes[cube], TARGETS[target], cubes[1 - cube]))
 
     def to_json(self) -> dict[str, Any]:
         """The parameters, for the record of a demonstration."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import UnknownNameError
-from rodif_core.tasks.base import Array, Context
-from rodif_core.tasks.experts import push
+from rodif_core.tasks.base import Array
+from rodif_core.tasks.experts.push import steer
 from rodif_core.tasks.sorting import BIN_Y, SortingTask, edge_point
 
 OVER_THE_EDGE = BIN_Y[0] + 0.012  # m; a cube whose centre is there falls
@@ -19,17 +19,17 @@ NOWHERE = (9.0, 9.0)  # m; where a cube that lies in its bin is for the rod abov
 
 @dataclass(frozen=True)
 class SortingExpert:
-    """Pushes one cube over the edge into its bin and then the other."""
+    """Pushes one cube over the edge into its bin and then the other.
+
+    Raises UnknownNameError for a mode that the task has not.
+    """
 
     mode: str
     tremble: ClassVar[float] = 0.0008  # m per control step: standard deviation of the hand's noise
 
-    @classmethod
-    def draw(cls, mode: str, context: Context, rng: np.random.Generator) -> SortingExpert:
-        """The expert of that mode; raises UnknownNameError for one that the task has not."""
-        if mode not in SortingTask.modes:
-            raise UnknownNameError("mode", mode, SortingTask.modes)
-        return cls(mode)
+    def __post_init__(self) -> None:
+        if self.mode not in SortingTask.modes:
+            raise UnknownNameError("mode", self.mode, SortingTask.modes)
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """The steady hand's action (2,) in metres for an observation (16,)."""
@@ -43,7 +43,7 @@ class SortingExpert:
         if other[1] > OVER_THE_EDGE:
             other = NOWHERE
         x, y = edge_point(np.array([cubes]), cube)[0]
-        return np.array(push.steer(rod, cubes[cube], (float(x), float(y)), other))
+        return np.array(steer(rod, cubes[cube], (float(x), float(y)), other))
 
     def to_json(self) -> dict[str, Any]:
         """The parameters, for the record of a demonstration."""
