@@ -48,7 +48,7 @@ START_X = (CELL_X[0][0], CELL_X[-1][1])
 START_Y = (CELL_Y[0][0], CELL_Y[-1][1])
 
 RGB = {"red": (0.84, 0.15, 0.16), "blue": (0.15, 0.35, 0.80)}
-GREY = (0.62, 0.64, 0.67, 1.0)
+GREY = (0.62, 0.64, 0.67, 0.6)  # seen through, so that replays show the cubes behind its edge
 
 
 class SortingTask(Task):
