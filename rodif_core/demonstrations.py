@@ -19,7 +19,7 @@ from rodif_core.errors import LearningError, TrajectoryFileError, ValueOutOfRang
 from rodif_core.tasks import Task
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts import draw_expert
-from rodif_core.trajectory import Trajectory
+from rodif_core.trajectory import Trajectory, episode_without_decisions
 
 TREMBLE_MEMORY = 0.8  # share of the hand's noise that stays from one control step to the next
 PARALLEL = 100  # simulations stepped together; changes the time, not the result
@@ -159,12 +159,11 @@ def _trajectory(
 ) -> Trajectory:
     """Cut one episode of `length` control steps out of its columns; it has no decisions."""
     observations, actions, qpos, paths = columns
-    return Trajectory(
+    return episode_without_decisions(
         observations=observations[: length + 1].copy(),
         actions=actions[:length].copy(),
         qpos=qpos[: length + 1].copy(),
         paths=paths[: length + 1].copy(),
-        **_no_decisions(task.observation_dim, task.action_dim),
         context=context,
         outcome=outcome,
         info={
@@ -238,21 +237,11 @@ def _cut(
         for name, column in columns.items()
     }
     return [
-        Trajectory(
+        episode_without_decisions(
             **{name: pieces[name][i].copy() for name in _ARRAYS},
-            **_no_decisions(pieces["observations"][i].shape[1], pieces["actions"][i].shape[1]),
             context=episode["context"],
             outcome=episode["outcome"],
             info=episode["info"],
         )
         for i, episode in enumerate(episodes)
     ]
-
-
-def _no_decisions(observation_dim: int, action_dim: int) -> dict[str, NDArray[Any]]:
-    """The arrays of an episode that no policy decided: T = 0, with the right ranks."""
-    return {
-        "histories": np.zeros((0, 1, observation_dim), np.float32),
-        "chains": np.zeros((0, 1, 1, action_dim), np.float32),
-        "decision_steps": np.zeros(0, np.int32),
-    }

@@ -24,7 +24,7 @@ from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig
 from rodif_core.spec import TaskName
-from rodif_core.tasks import get_task
+from rodif_core.tasks import Task, get_task
 from rodif_core.training_state import load_state, save_state
 from rodif_core.trajectory import Trajectory
 
@@ -44,6 +44,7 @@ class PretrainConfig:
     weight_decay: float = 1e-6
     warm_up: int = 200
     ema_decay: float = 0.999
+    executed_steps: int = 8  # Te: control steps between two decisions of the policy
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     seed: int = 0
 
@@ -94,11 +95,14 @@ def pretrain(
     demonstrations: Sequence[Trajectory],
     config: PretrainConfig,
     *,
+    start: Checkpoint | None = None,
     workspace: Path | None = None,
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> Checkpoint:
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
+
+    start  go on from this policy, with its size and normaliser, instead of from fresh weights
 
     The result holds the averaged weights, the normaliser and the support set. Raises
     LearningError when the loss is not finite.
@@ -108,11 +112,8 @@ def pretrain(
     order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
     held_out = [demonstrations[i] for i in order[:held_out_count]]
     known = [demonstrations[i] for i in order[held_out_count:]]
-    normaliser = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
-    size = PolicyConfig(task.observation_dim, task.action_dim, channels=config.channels)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        policy = DiffusionPolicy.build(size, normaliser)
+    policy = start.policy.copy() if start is not None else _fresh(task, known, config)
+    size, normaliser = policy.config, policy.normaliser
     average, curve = _train(
         policy,
         Windows.cut(known, size, normaliser),
@@ -127,10 +128,25 @@ def pretrain(
     card = {
         "kind": "pretrained",
         "preset": asdict(config),
+        "start": None if start is None else start.digest,
         "demonstrations": len(demonstrations),
         "held_out_curve": curve,
     }
     return Checkpoint(task_name, trained, support, card)
+
+
+def _fresh(task: Task, known: Sequence[Trajectory], config: PretrainConfig) -> DiffusionPolicy:
+    """Untrained weights that depend on the seed alone."""
+    normaliser = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
+    size = PolicyConfig(
+        task.observation_dim,
+        task.action_dim,
+        executed_steps=config.executed_steps,
+        channels=config.channels,
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return DiffusionPolicy.build(size, normaliser)
 
 
 def _train(

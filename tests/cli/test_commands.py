@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
+from rodif_core.shipped import shipped_tasks
+from rodif_core.spec import TaskName
 from tests.core.learning import tiny_checkpoint
 from worker.cli.main import main
 from worker.cli.options import number_list
@@ -80,6 +82,37 @@ def test_pretrain_writes_a_checkpoint_with_its_measurements(
     assert made.card["evaluation"]["n"] == 4
     assert made.card["demonstrations"] == 24
     assert made.digest in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path: Path):
+    file = tmp_path / "new.safetensors"
+    sizes = ["--demonstrations", "4", "--updates", "2", "--evaluate", "0"]
+    rounds = ["--rounds", "1", "--recoveries", "4", "--executed-steps", "4"]
+    work = ["--workspace", str(tmp_path / "work")]
+    assert main(["pretrain", "pushing", "--out", str(file), *sizes, *rounds, *work]) == 0
+    made = load_checkpoint(file.read_bytes())
+    assert made.task is TaskName.PUSHING
+    assert made.policy.config.executed_steps == 4
+    assert made.card["start"] is not None
+    assert made.card["demonstrations"] == 4 + made.card["recoveries"]
+
+
+@pytest.mark.parametrize("option", ["--rounds", "--evaluate"])
+def test_pretrain_refuses_negative_numbers(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["pretrain", "avoid", "--out", str(tmp_path / "x"), option, "-1"]) == 1
+    assert "is -1, but must be at least 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", ["pushing", "sorting"])
+def test_evaluate_of_a_task_without_a_checkpoint_names_those_with_one(
+    task: str, capsys: pytest.CaptureFixture[str]
+):
+    if TaskName(task) not in shipped_tasks():
+        assert main(["evaluate", task]) == 1
+        assert "tasks that have one: 'avoid'" in capsys.readouterr().err
 
 
 def test_number_list_takes_numbers_and_ranges():
