@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from labeling_ui.mode_plot import GROUP_COLOURS
+from rodif_core.demonstrations import load_demonstrations
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
 from rodif_core.shipped import shipped_tasks
 from rodif_core.spec import TaskName
@@ -113,6 +116,40 @@ def test_evaluate_of_a_task_without_a_checkpoint_names_those_with_one(
     if TaskName(task) not in shipped_tasks():
         assert main(["evaluate", task]) == 1
         assert "tasks that have one: 'avoid'" in capsys.readouterr().err
+
+
+def test_tasks_lists_every_task_with_its_modes(capsys: pytest.CaptureFixture[str]):
+    assert main(["tasks", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["task"] for row in rows] == [task.value for task in TaskName]
+    assert [row["task"] for row in rows if row["shipped_checkpoint"]] == shipped_tasks()
+    assert all(row["preferred_group"] in row["groups"] for row in rows)
+    assert main(["tasks"]) == 0
+    assert "pushing" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("task", ["avoid", "pushing", "sorting"])
+def test_demos_writes_a_set_that_plot_can_draw(
+    task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file, picture = tmp_path / "set.npz", tmp_path / "modes.png"
+    share = ["--preferred-share", "0.5"]
+    assert main(["demos", task, "--out", str(file), "--n", "4", "--seed", "3", *share]) == 0
+    made = load_demonstrations(file)
+    assert len(made) == 4 and all(one.success and one.info["seed"] == 3 for one in made)
+    assert made[0].outcome["mode"] in capsys.readouterr().out
+    assert main(["plot", "modes", str(file), "--out", str(picture)]) == 0
+    with Image.open(picture) as drawn:
+        colours = {colour for _, colour in drawn.convert("RGB").getcolors(1 << 20)}
+    assert set(GROUP_COLOURS[:2]) <= colours  # both groups of the legend
+
+
+def test_plot_of_a_foreign_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = ["--out", str(tmp_path / "x.png")]
+    assert main(["plot", "modes", str(tmp_path / "none.npz"), *out]) == 1
+    assert "not a readable demonstration set" in capsys.readouterr().err
+    assert main(["plot", "modes", "juggling", *out]) == 1
+    assert "'juggling' is neither a readable file" in capsys.readouterr().err
 
 
 def test_number_list_takes_numbers_and_ranges():
