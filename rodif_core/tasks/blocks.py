@@ -9,21 +9,23 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.tasks.base import Array, Context
+from rodif_core.tasks.panda import ROD_GEOM, TABLE_GEOM, Mesh, rod_scene
 
 Range = tuple[float, float]
 
 HALF = 0.03  # m, half edge of every cube, as D3IL
 MASS = 0.05  # kg, as D3IL
 FRICTION = 0.5  # of cubes on what they stand on
-# Ours. D3IL's rod has 1 cm; a round tip of 2 cm that grips slides off a cube's face less easily,
-# and that makes pushing learnable from few demonstrations.
+# Ours; D3IL's rod has 1 cm. Measured with the experts: a rod that grips (friction 1) drags a cube's
+# face along when it should slide to the middle, so pushes miss by centimetres.
 PUSHER_RADIUS = 0.02  # m
-PUSHER_FRICTION = 1.0
+PUSHER_FRICTION = 0.4
 
 # Set-points stay where the arm can hold the rod upright (measured: beyond 0.80 m it cannot).
 MIN_X, MAX_X = 0.30, 0.72  # m
@@ -37,6 +39,17 @@ MAX_YAW = np.pi / 2  # rad; cubes start turned by up to this, either way
 APART = 0.09  # m between the centres of two cubes at the start: their diagonals are 8.5 cm
 
 NEAR = 0.06  # m; scale on which `push_frame` tells places beside a cube apart
+
+
+def pusher_scene(mesh: Mesh) -> mujoco.MjSpec:
+    """The arm with a rod for pushing, on a table."""
+    spec = rod_scene(mesh, rod_radius=PUSHER_RADIUS)
+    rod = spec.geom(ROD_GEOM)
+    rod.friction[0] = PUSHER_FRICTION
+    rod.priority = 1  # else the cube's larger friction counts
+    rod.condim = 4
+    spec.geom(TABLE_GEOM).friction[0] = FRICTION
+    return spec
 
 
 def clamp_reach(points: Array) -> Array:

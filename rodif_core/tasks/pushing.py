@@ -1,7 +1,7 @@
 """Pushing: move a red and a green cube onto two targets with the tip of the rod.
 
 Cubes, targets, start ranges, success and the order of visits are those of D3IL's "Pushing" (Jia et
-al., ICLR 2024). Different from D3IL, on purpose: the rod is thicker and grips (see `blocks`), yaw
+al., ICLR 2024). Different from D3IL, on purpose: the rod is thicker (see `blocks`), yaw
 is given as sine and cosine of four times the angle instead of its tangent, observations add the
 rod's place in the frame of each of the four possible pushes, they show the state after the step,
 and set-points stay within the arm's reach.
@@ -19,7 +19,7 @@ import rodif_core.tasks.blocks as blocks
 from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
 from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
-from rodif_core.tasks.panda import CONTROL_DT, ROD_GEOM, TABLE_GEOM, Mesh, add_cube, rod_scene
+from rodif_core.tasks.panda import CONTROL_DT, Mesh, add_cube
 
 TARGETS = ((0.42, 0.30), (0.63, 0.30))  # m; red target, green target
 TARGET_HALF = 0.05  # m, drawn only
@@ -68,9 +68,7 @@ class PushingTask(Task):
     )
 
     def build_model(self, mesh: Mesh = "col") -> mujoco.MjModel:
-        spec = rod_scene(mesh, rod_radius=blocks.PUSHER_RADIUS)
-        spec.geom(ROD_GEOM).friction[0] = blocks.PUSHER_FRICTION
-        spec.geom(TABLE_GEOM).friction[0] = blocks.FRICTION
+        spec = blocks.pusher_scene(mesh)
         for index, name in enumerate(self.objects):
             spec.worldbody.add_geom(
                 name=f"{name}_target",

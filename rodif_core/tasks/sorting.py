@@ -1,7 +1,7 @@
 """Sorting: push a red and a blue cube off a platform, each into the bin of its colour.
 
 Platform, bins, start cells, success and the order of sorting are those of D3IL's "Sorting" with two
-cubes (Jia et al., ICLR 2024). Different from D3IL, on purpose: the rod is thicker and grips (see
+cubes (Jia et al., ICLR 2024). Different from D3IL, on purpose: the rod is thicker (see
 `blocks`), a bin has three walls and begins at the platform's edge, yaw is given as sine and cosine
 of four times the angle instead of its tangent, observations add the rod's place in the frame of
 both pushes, they show the state after the step, set-points stay within the arm's reach, and a cube
@@ -23,11 +23,9 @@ from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
 from rodif_core.tasks.panda import (
     CONTROL_DT,
     OBJECT_BIT,
-    ROD_GEOM,
     TOOL_BIT,
     Mesh,
     add_cube,
-    rod_scene,
 )
 
 PLATFORM_X = (0.2, 0.8)  # m
@@ -74,8 +72,7 @@ class SortingTask(Task):
     )
 
     def build_model(self, mesh: Mesh = "col") -> mujoco.MjModel:
-        spec = rod_scene(mesh, rod_radius=blocks.PUSHER_RADIUS)
-        spec.geom(ROD_GEOM).friction[0] = blocks.PUSHER_FRICTION
+        spec = blocks.pusher_scene(mesh)
         _add_fixed(spec, "platform", PLATFORM_X, PLATFORM_Y, PLATFORM_TOP, GREY)
         for index, name in enumerate(self.objects):
             _add_bin(spec, name, BIN_X[index])

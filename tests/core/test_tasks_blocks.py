@@ -278,7 +278,9 @@ def test_the_field_has_no_jump_from_turning_in_to_pushing() -> None:
     for along in (-0.06, -0.075, -0.09, -0.12):
         across = np.linspace(-0.06, 0.06, 241)  # every half millimetre
         field = np.array([steer((0.45 - a, -0.1 + along), cube, target, far) for a in across])
-        assert np.linalg.norm(np.diff(field, axis=0), axis=1).max() < 0.0015
+        assert (
+            np.linalg.norm(np.diff(field, axis=0), axis=1).max() < 0.002
+        )  # a switch would be 0.014
 
 
 def test_a_rod_in_front_of_a_cube_goes_round_it() -> None:

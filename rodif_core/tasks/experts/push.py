@@ -17,7 +17,7 @@ Point = tuple[float, float]
 
 BEHIND = 0.085  # m; where a rod that is off the axis heads for, behind the cube's centre
 AHEAD = 0.10  # m; where a rod on the axis heads for
-AXIS_WIDTH = 0.013  # m off the axis at which the aim has fallen to 1/e of AHEAD, beside the cube
+AXIS_WIDTH = 0.011  # m off the axis at which the aim has fallen to 1/e of AHEAD, beside the cube
 AXIS_OPENING = 0.25  # how much that widens per metre farther behind than BEHIND
 KEEP_OUT = (
     0.075  # m; the rod goes round a cube's centre at this distance: half diagonal + rod + 1 cm
