@@ -26,6 +26,7 @@ KEEP_OUT_EDGE = 0.035  # m; the way round begins to bend this far outside KEEP_O
 FREE_ANGLE, ROUND_ANGLE = 0.55, 0.95  # rad behind the cube: no way round below, in full above
 DETOUR = 0.105  # m; a pushed cube passes the other one's centre at this distance
 SQUEEZE = (0.07, 0.11)  # m from the place behind the cube: nearer, the other cube is not avoided
+ROOM_X = (0.36, 0.66)  # m; a cube farther out cannot be pushed back inwards: no detours there
 FREE_SPEED = 0.0105  # m per control step
 PUSH_SPEED = 0.0070
 SLOW_BEFORE = 0.04  # m before the target the push slows down, to SLOWEST of its speed
@@ -69,6 +70,9 @@ def bend(cube: Point, target: Point, other: Point) -> Point:
         return ux, uy
     reach = max(ahead, 0.06)
     sign = -1.0 if aside > 0 else 1.0  # to the side where the other one is not
+    passing = other[0] - sign * DETOUR * uy
+    if not ROOM_X[0] < passing < ROOM_X[1]:
+        sign = -sign
     return unit(reach * ux - sign * wanted * uy, reach * uy + sign * wanted * ux)
 
 
