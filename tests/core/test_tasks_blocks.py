@@ -296,10 +296,15 @@ def test_a_rod_in_front_of_a_cube_goes_round_it() -> None:
 
 
 def test_a_push_passes_a_cube_that_stands_in_its_way() -> None:
-    straight = bend((0.45, -0.1), (0.45, 0.3), (9.0, 9.0))
+    straight = bend((0.52, -0.1), (0.52, 0.3), (9.0, 9.0))
     assert straight == pytest.approx((0.0, 1.0))
-    for x, sign in ((0.44, 1), (0.46, -1)):
-        assert sign * bend((0.45, -0.1), (0.45, 0.3), (x, 0.02))[0] > 0.3
+    for x, sign in ((0.51, 1), (0.53, -1)):
+        assert sign * bend((0.52, -0.1), (0.52, 0.3), (x, 0.02))[0] > 0.3
+
+
+def test_a_push_makes_no_detour_to_where_a_cube_cannot_be_fetched() -> None:
+    outer = bend((0.62, -0.1), (0.62, 0.3), (0.61, 0.02))
+    assert outer[0] < -0.3
 
 
 def test_going_round_keeps_what_leads_outwards() -> None:
