@@ -15,12 +15,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from rodif_core.tasks.base import COLLISION, Task
-from rodif_core.tasks.panda import ROD_GEOM
+from rodif_core.tasks.panda import ROD_GEOM, TABLE_GEOM
 from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-TABLE_GEOM = "table"
 MESH_CELL = 0.008  # m; vertices of the arm's drawing that are nearer than this are merged
 POSE_GRID = 2.0**-14  # m and quaternion units; rounding poses makes a replay 30 % smaller
 VISUAL_GROUP = 2  # geoms of higher groups are collision hulls and helpers

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from rodif_core.errors import LearningError, TrajectoryFileError, ValueOutOfRangeError
 from rodif_core.tasks import Task
 from rodif_core.tasks.env import BatchEnv
-from rodif_core.tasks.experts.avoid import TREMBLE, TREMBLE_MEMORY, AvoidExpert
-from rodif_core.trajectory import Trajectory
+from rodif_core.tasks.experts import draw_expert
+from rodif_core.trajectory import Trajectory, episode_without_decisions
 
-DEFAULT_LEFT_SHARE = 0.2
+TREMBLE_MEMORY = 0.8  # share of the hand's noise that stays from one control step to the next
 PARALLEL = 100  # simulations stepped together; changes the time, not the result
 MAX_ATTEMPTS = 20  # draws for one demonstration before we say that something is wrong
 
@@ -46,15 +46,16 @@ def make_demonstrations(
     *,
     episodes: int,
     seed: int,
-    left_share: float = DEFAULT_LEFT_SHARE,
+    preferred_share: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Trajectory]:
-    """Successful demonstrations in their intended modes, `left_share` of them left.
+    """Successful demonstrations in their intended modes.
 
-    Both sides are balanced over their twelve modes. Demonstration i depends on (seed, i) and its
-    mode only, not on how many run together.
+    Demonstration i depends on (seed, i) and its mode only, not on how many run together.
 
-    progress  called with (made, episodes) from time to time
+    preferred_share  share of the task's preferred group, by default the task's own; its modes are
+                     balanced, and so are all others
+    progress         called with (made, episodes) from time to time
 
     Raises ValueOutOfRangeError for values out of range and LearningError when the expert keeps
     failing.
@@ -63,12 +64,13 @@ def make_demonstrations(
         raise ValueOutOfRangeError("episodes", episodes, "at least 1")
     if seed < 0:
         raise ValueOutOfRangeError("seed", seed, "0 or more")
-    if not 0 <= left_share <= 1:
-        raise ValueOutOfRangeError("left_share", left_share, "in [0, 1]")
+    share = task.preferred_share if preferred_share is None else preferred_share
+    if not 0 <= share <= 1:
+        raise ValueOutOfRangeError("preferred_share", share, "in [0, 1]")
     made: dict[int, Trajectory] = {}
     env = BatchEnv(task, min(PARALLEL, episodes))
     waiting = [
-        _Assignment(i, mode, 0) for i, mode in enumerate(assign_modes(task, episodes, left_share))
+        _Assignment(i, mode, 0) for i, mode in enumerate(assign_modes(task, episodes, share))
     ]
     while waiting:
         batch, waiting = waiting[:PARALLEL], waiting[PARALLEL:]
@@ -88,18 +90,16 @@ def make_demonstrations(
     return [made[index] for index in range(episodes)]
 
 
-def assign_modes(task: Task, episodes: int, left_share: float) -> list[str]:
-    """The mode of each demonstration: the sides spread evenly, their modes in turn."""
-    sides = {
-        "left": [mode for mode in task.modes if mode.startswith("L")],
-        "right": [mode for mode in task.modes if mode.startswith("R")],
-    }
-    lefts = np.floor(np.arange(episodes + 1) * left_share + 0.5).astype(int)
+def assign_modes(task: Task, episodes: int, preferred_share: float) -> list[str]:
+    """The mode of each demonstration: the preferred group spread evenly, modes in turn."""
+    liked = [mode for mode in task.modes if task.group_of(mode) == task.preferred_group]
+    others = [mode for mode in task.modes if mode not in liked]
+    counts = np.floor(np.arange(episodes + 1) * preferred_share + 0.5).astype(int)
     modes = []
     for index in range(episodes):
-        left = lefts[index + 1] > lefts[index]
-        turn = lefts[index] if left else index - lefts[index]
-        choices = sides["left" if left else "right"]
+        is_liked = counts[index + 1] > counts[index]
+        turn = counts[index] if is_liked else index - counts[index]
+        choices = liked if is_liked else others
         modes.append(choices[turn % len(choices)])
     return modes
 
@@ -110,16 +110,17 @@ def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list
     generators = [assignment.generator(seed) for assignment in batch]
     contexts = [task.sample_context(rng) for rng in generators]
     experts = [
-        AvoidExpert.draw(assignment.mode, tuple(context["start"]), rng)
+        draw_expert(task.name, assignment.mode, context, rng)
         for assignment, context, rng in zip(batch, contexts, generators, strict=True)
     ]
     observations = [env.reset(contexts)]
     qpos, paths, actions = [env.qpos], [env.paths], []
     tremble = np.zeros((len(batch), task.action_dim))
-    fresh = TREMBLE * np.sqrt(1 - TREMBLE_MEMORY**2)  # keeps the standard deviation at TREMBLE
     while not env.done.all():
         action = np.zeros((len(batch), task.action_dim), dtype=np.float32)
         for i in np.flatnonzero(~env.done):
+            # Scaled so that the standard deviation stays at the expert's tremble.
+            fresh = experts[i].tremble * np.sqrt(1 - TREMBLE_MEMORY**2)
             kick = generators[i].normal(0.0, fresh, task.action_dim)
             tremble[i] = TREMBLE_MEMORY * tremble[i] + kick
             wanted = experts[i].act(observations[-1][i]) + tremble[i]
@@ -158,12 +159,11 @@ def _trajectory(
 ) -> Trajectory:
     """Cut one episode of `length` control steps out of its columns; it has no decisions."""
     observations, actions, qpos, paths = columns
-    return Trajectory(
+    return episode_without_decisions(
         observations=observations[: length + 1].copy(),
         actions=actions[:length].copy(),
         qpos=qpos[: length + 1].copy(),
         paths=paths[: length + 1].copy(),
-        **_no_decisions(task.observation_dim, task.action_dim),
         context=context,
         outcome=outcome,
         info={
@@ -237,21 +237,11 @@ def _cut(
         for name, column in columns.items()
     }
     return [
-        Trajectory(
+        episode_without_decisions(
             **{name: pieces[name][i].copy() for name in _ARRAYS},
-            **_no_decisions(pieces["observations"][i].shape[1], pieces["actions"][i].shape[1]),
             context=episode["context"],
             outcome=episode["outcome"],
             info=episode["info"],
         )
         for i, episode in enumerate(episodes)
     ]
-
-
-def _no_decisions(observation_dim: int, action_dim: int) -> dict[str, NDArray[Any]]:
-    """The arrays of an episode that no policy decided: T = 0, with the right ranks."""
-    return {
-        "histories": np.zeros((0, 1, observation_dim), np.float32),
-        "chains": np.zeros((0, 1, 1, action_dim), np.float32),
-        "decision_steps": np.zeros(0, np.int32),
-    }

@@ -27,7 +27,7 @@ from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig, Size
 from rodif_core.policies.transformer import TransformerSize
 from rodif_core.policies.unet import UnetSize
 from rodif_core.spec import Architecture, TaskName
-from rodif_core.tasks import get_task
+from rodif_core.tasks import Task, get_task
 from rodif_core.training_state import load_state, save_state
 from rodif_core.trajectory import Trajectory
 
@@ -46,7 +46,7 @@ class PretrainConfig:
     size: Size = UnetSize()  # widths; its type is the architecture
     observation_steps: int = 2  # To
     predicted_steps: int = 16  # Tp
-    executed_steps: int = 8  # Te
+    executed_steps: int = 8  # Te: control steps between two decisions of the policy
     denoising_steps: int = 20  # K
     updates: int = 10_000
     batch_size: int = 128
@@ -171,11 +171,14 @@ def pretrain(
     demonstrations: Sequence[Trajectory],
     config: PretrainConfig,
     *,
+    start: Checkpoint | None = None,
     workspace: Path | None = None,
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> Checkpoint:
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
+
+    start  go on from this policy, with its size and normaliser, instead of from fresh weights
 
     The result holds the averaged weights, the normaliser and the support set. Raises
     LearningError when the loss is not finite.
@@ -185,11 +188,8 @@ def pretrain(
     order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
     held_out = [demonstrations[i] for i in order[:held_out_count]]
     known = [demonstrations[i] for i in order[held_out_count:]]
-    normaliser = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
-    shape = config.policy_config(task.observation_dim, task.action_dim)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        policy = DiffusionPolicy.build(shape, normaliser)
+    policy = start.policy.copy() if start is not None else _fresh(task, known, config)
+    shape, normaliser = policy.config, policy.normaliser
     average, curve = _train(
         policy,
         Windows.cut(known, shape, normaliser),
@@ -205,10 +205,20 @@ def pretrain(
         "kind": "pretrained",
         "architecture": shape.architecture.value,
         "preset": asdict(config),
+        "start": None if start is None else start.digest,
         "demonstrations": len(demonstrations),
         "held_out_curve": curve,
     }
     return Checkpoint(task_name, trained, support, card)
+
+
+def _fresh(task: Task, known: Sequence[Trajectory], config: PretrainConfig) -> DiffusionPolicy:
+    """Untrained weights that depend on the seed alone."""
+    normaliser = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
+    shape = config.policy_config(task.observation_dim, task.action_dim)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return DiffusionPolicy.build(shape, normaliser)
 
 
 def _train(

@@ -21,6 +21,8 @@ class TaskName(StrEnum):
     """Robot tasks that can be rolled out, labelled and fine-tuned."""
 
     AVOID = "avoid"
+    PUSHING = "pushing"
+    SORTING = "sorting"
 
 
 class Architecture(StrEnum):

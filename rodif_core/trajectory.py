@@ -121,3 +121,28 @@ class Trajectory:
                 f" this version reads {FORMAT_VERSION}"
             )
         return cls(**arrays, context=meta["context"], outcome=meta["outcome"], info=meta["info"])
+
+
+def episode_without_decisions(
+    *,
+    observations: NDArray[np.float32],
+    actions: NDArray[np.float32],
+    qpos: NDArray[np.float32],
+    paths: NDArray[np.float32],
+    context: dict[str, Any],
+    outcome: dict[str, Any],
+    info: dict[str, Any],
+) -> Trajectory:
+    """An episode that no policy decided: T = 0, with the right ranks. Arrays as in Trajectory."""
+    return Trajectory(
+        observations=observations,
+        actions=actions,
+        qpos=qpos,
+        paths=paths,
+        histories=np.zeros((0, 1, observations.shape[1]), np.float32),
+        chains=np.zeros((0, 1, 1, actions.shape[1]), np.float32),
+        decision_steps=np.zeros(0, np.int32),
+        context=context,
+        outcome=outcome,
+        info=info,
+    )

@@ -11,12 +11,11 @@ import importlib.metadata
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from sqlalchemy import select
 
-from rodif_core.errors import CheckpointFileError
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import TaskName
 from server.bootstrap import ensure_admin, register_checkpoint
 from server.campaigns import create_campaign
@@ -53,31 +52,16 @@ def prepare(settings: Settings, *, admin_password: str | None = None) -> Prepare
             password = ensure_admin(
                 session, utc_now(), ADMIN, admin_password, cheap=settings.argon2_cheap
             )
-        for task in TaskName:
+        for task in shipped_tasks():
             register_shipped(settings, database, task)
         return Prepared(ADMIN, password, _ensure_campaign(database))
     finally:
         database.dispose()
 
 
-def shipped_bytes(task: TaskName) -> bytes:
-    """The pretrained checkpoint that comes with the package, read without torch.
-
-    Raises CheckpointFileError when it is missing.
-    """
-    file = resources.files("rodif_core") / "checkpoints" / f"{task}.safetensors"
-    try:
-        return file.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointFileError(
-            f"no checkpoint is shipped for task {task.value!r}: {file} is missing;"
-            " install the project again"
-        ) from None
-
-
 def register_shipped(settings: Settings, database: Database, task: TaskName) -> int:
     """Make the shipped checkpoint of a task known to the database; returns its id."""
-    blob = shipped_bytes(task)
+    blob = shipped_checkpoint(task)
     sha256 = hashlib.sha256(blob).hexdigest()
     known = select(Checkpoint.id).where(Checkpoint.artifact_sha256 == sha256)
     assert settings.artifact_dir is not None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 import safetensors
@@ -92,14 +91,6 @@ def load_checkpoint(data: bytes) -> Checkpoint:
             f"its header says {str(header['digest'])[:12]}…"
         )
     return checkpoint
-
-
-def shipped_checkpoint(task: TaskName) -> bytes:
-    """The pretrained checkpoint of a task that is part of the package."""
-    file = resources.files("rodif_core") / "checkpoints" / f"{task.value}.safetensors"
-    if not file.is_file():
-        raise CheckpointFileError(f"no checkpoint is shipped for task {task.value!r}: {file}")
-    return file.read_bytes()
 
 
 def _tensors(checkpoint: Checkpoint) -> dict[str, Tensor]:

@@ -6,8 +6,14 @@ from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
 from rodif_core.tasks.avoid import AvoidTask
 from rodif_core.tasks.base import Task
+from rodif_core.tasks.pushing import PushingTask
+from rodif_core.tasks.sorting import SortingTask
 
-TASKS: dict[TaskName, Task] = {TaskName.AVOID: AvoidTask()}
+TASKS: dict[TaskName, Task] = {
+    TaskName.AVOID: AvoidTask(),
+    TaskName.PUSHING: PushingTask(),
+    TaskName.SORTING: SortingTask(),
+}
 
 
 def get_task(name: str) -> Task:

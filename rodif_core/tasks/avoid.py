@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.spec import TaskName
-from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task
+from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
 from rodif_core.tasks.panda import CONTROL_DT, OBJECT_BIT, TOOL_BIT, Mesh, rod_scene
 
 # Rows of cylinders in the order of travel: (x, y, radius) in metres, left (small x) to right.
@@ -58,6 +58,7 @@ class AvoidTask(Task):
     action_limit: ClassVar[float] = 0.0125  # m per control step: 0.357 m/s
     control_dt: ClassVar[float] = CONTROL_DT
     max_steps: ClassVar[int] = 150
+    contact_ends: ClassVar[bool] = True
     groups: ClassVar[tuple[str, ...]] = ("left", "right")
     preferred_group: ClassVar[str] = "left"
     modes: ClassVar[tuple[str, ...]] = tuple(
@@ -110,9 +111,12 @@ class AvoidTask(Task):
         if point.shape != (2,) or not np.isfinite(point).all() or point[1] > -0.15:
             raise ValueOutOfRangeError("start", start, legal)
         point = np.append(point, ROD_HEIGHT)
-        if not self.inside(point[None])[0]:
+        if not self._within(point[None])[0]:
             raise ValueOutOfRangeError("start", start, legal)
         return point
+
+    def group_of(self, mode: str) -> str:
+        return self.groups["LR".index(mode[0])]
 
     def move(self, setpoints: Array, actions: Array) -> Array:
         moved = setpoints.copy()
@@ -124,20 +128,29 @@ class AvoidTask(Task):
         moved[:, :2] *= (legal / reach)[:, None]
         return moved
 
-    def observe(self, setpoints: Array, ends: Array) -> Array:
-        return np.concatenate([setpoints[:, :2], ends[:, :2]], axis=1)
+    def observe(self, view: View) -> Array:
+        return np.concatenate([view.setpoints[:, :2], view.ends[:, :2]], axis=1)
 
-    def finished(self, ends: Array) -> NDArray[np.bool_]:
-        return np.asarray(ends[:, 1] > FINISH_Y)
+    def finished(self, view: View) -> NDArray[np.bool_]:
+        return np.asarray(view.ends[:, 1] > FINISH_Y)
 
-    def inside(self, ends: Array) -> NDArray[np.bool_]:
+    def inside(self, view: View) -> NDArray[np.bool_]:
+        return self._within(view.ends)
+
+    @staticmethod
+    def _within(ends: Array) -> NDArray[np.bool_]:
         x, y = ends[:, 0], ends[:, 1]
         reach = np.sqrt(x**2 + y**2)
         return np.asarray(
             (x >= MIN_X) & (x <= MAX_X) & (y >= MIN_Y) & (reach >= MIN_REACH) & (reach <= MAX_REACH)
         )
 
-    def outcome(self, path: NDArray[np.floating[Any]], reason: str) -> dict[str, Any]:
+    def outcome(
+        self,
+        path: NDArray[np.floating[Any]],
+        objects: NDArray[np.floating[Any]],  # noqa: ARG002 - Avoid has none
+        reason: str,
+    ) -> dict[str, Any]:
         if reason not in REASONS:
             raise UnknownNameError("reason", reason, REASONS)
         gaps = passed_gaps(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import mujoco
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.spec import TaskName
-from rodif_core.tasks.panda import Mesh
+from rodif_core.tasks.panda import ARM_JOINTS, Mesh
 
 Array = NDArray[np.float64]
 Context = Mapping[str, Any]
@@ -25,12 +26,31 @@ DIVERGED = "diverged"
 REASONS = (FINISHED, COLLISION, LEFT_WORKSPACE, TIME_LIMIT, DIVERGED)
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a task sees of m simulations after a control step; positions in metres.
+
+    setpoints  (m, 3)
+    ends       (m, 3) end effectors
+    objects    (m, B, 7) poses x, y, z and quaternion w, x, y, z of the B movable objects, rounded
+               to float32 as trajectories store them: what is read from a stored trajectory is what
+               was read while it ran
+    """
+
+    setpoints: Array
+    ends: Array
+    objects: Array
+
+
 class Task(ABC):
     """One task: its numbers, its scene, its starts, and what counts as success and as a mode.
 
     A task holds no state: one instance serves any number of simulations. In all methods m is the
-    number of simulations, positions are in metres in the robot's base frame, and an *end* is the
-    position of the end effector.
+    number of simulations, B that of the movable objects, positions are in metres in the robot's
+    base frame, and an *end* is the position of the end effector.
+
+    The model of a task has the arm's joints first and then one free joint an object, in the order
+    of `objects`.
     """
 
     name: ClassVar[TaskName]
@@ -39,9 +59,12 @@ class Task(ABC):
     action_limit: ClassVar[float]  # m per control step and axis; larger actions are clipped
     control_dt: ClassVar[float]  # s
     max_steps: ClassVar[int]  # control steps; longer episodes fail
+    objects: ClassVar[tuple[str, ...]] = ()  # names of the movable bodies
+    contact_ends: ClassVar[bool]  # whether the rod's first contact ends the episode as a failure
     modes: ClassVar[tuple[str, ...]]  # codes of all ways to succeed
     groups: ClassVar[tuple[str, ...]]  # coarse modes that annotators can prefer
     preferred_group: ClassVar[str]
+    preferred_share: ClassVar[float] = 0.2  # of the preferred group in scripted demonstrations
     criterion: ClassVar[str]  # what annotators are asked
 
     @abstractmethod
@@ -59,29 +82,48 @@ class Task(ABC):
         Raises ValueOutOfRangeError when the context lacks a value or has one outside its range.
         """
 
+    def start_objects(self, context: Context) -> Array:  # noqa: ARG002 - none by default
+        """First poses (B, 7) of the objects; the scene comes to rest from there.
+
+        Raises ValueOutOfRangeError as `start_point` does.
+        """
+        return np.zeros((0, 7))
+
+    @abstractmethod
+    def group_of(self, mode: str) -> str:
+        """The group that a mode belongs to."""
+
     @abstractmethod
     def move(self, setpoints: Array, actions: Array) -> Array:
         """Next set-points (m, 3) from the last (m, 3) and clipped actions (m, A), within reach."""
 
     @abstractmethod
-    def observe(self, setpoints: Array, ends: Array) -> Array:
-        """Observations (m, O) from set-points (m, 3) and ends (m, 3)."""
+    def observe(self, view: View) -> Array:
+        """Observations (m, O)."""
 
     @abstractmethod
-    def finished(self, ends: Array) -> NDArray[np.bool_]:
+    def finished(self, view: View) -> NDArray[np.bool_]:
         """Which simulations (m,) have reached the goal."""
 
     @abstractmethod
-    def inside(self, ends: Array) -> NDArray[np.bool_]:
+    def inside(self, view: View) -> NDArray[np.bool_]:
         """Which simulations (m,) are within the workspace limits."""
 
     @abstractmethod
-    def outcome(self, path: NDArray[np.floating[Any]], reason: str) -> dict[str, Any]:
-        """Outcome of an episode with end positions `path` (N + 1, 3) that ended for `reason`.
+    def outcome(
+        self, path: NDArray[np.floating[Any]], objects: NDArray[np.floating[Any]], reason: str
+    ) -> dict[str, Any]:
+        """Outcome of an episode with end positions `path` (N + 1, 3) and object poses `objects`
+        (N + 1, B, 7) that ended for `reason`. Raises UnknownNameError for a foreign reason.
 
         {"success": bool, "mode": str | None, "group": str | None, "reason": str}. The mode is None
-        until it is earned by success; the group is kept as soon as the path has settled it.
+        until it is earned by success; the group is kept as soon as the episode has settled it.
         """
+
+    def object_poses(self, qpos: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+        """Object poses (…, B, 7) in physics positions (…, Q), such as a trajectory's `qpos`."""
+        poses = qpos[..., ARM_JOINTS:]
+        return poses.reshape(*poses.shape[:-1], len(self.objects), 7)
 
     @abstractmethod
     def scene_shapes(self) -> list[dict[str, Any]]:

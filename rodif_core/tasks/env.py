@@ -23,9 +23,12 @@ from rodif_core.tasks.base import (
     TIME_LIMIT,
     Context,
     Task,
+    View,
 )
 from rodif_core.tasks.control import RodKinematics
 from rodif_core.tasks.panda import CONTACT_SENSOR, PHYSICS_STEPS, TOOL_SITE
+
+REST_STEPS = 10  # control steps (0.35 s) in which objects come to rest before an episode
 
 
 class BatchEnv:
@@ -52,9 +55,12 @@ class BatchEnv:
         self._contact = int(model.sensor(CONTACT_SENSOR).adr[0])
         self._setpoints = np.zeros((n, 3))
         self._ends = np.zeros((n, 3))
-        self._joints = np.zeros((n, model.nq))
+        self._positions = np.zeros((n, model.nq))
         # float32, as trajectories store it: modes can be read again from what was stored.
-        self._history = np.zeros((task.max_steps + 1, n, 3), dtype=np.float32)
+        self._path_history = np.zeros((task.max_steps + 1, n, 3), dtype=np.float32)
+        self._object_history = np.zeros(
+            (task.max_steps + 1, n, len(task.objects), 7), dtype=np.float32
+        )
         self._steps = np.zeros(n, dtype=np.int64)
         self._reasons: list[str | None] = [None] * n
         self._episodes = 0
@@ -70,20 +76,25 @@ class BatchEnv:
         if not 1 <= count <= self.n:
             raise ValueOutOfRangeError("number of contexts", count, f"1 … {self.n}")
         starts = np.stack([self.task.start_point(context) for context in contexts])
+        objects = np.stack([self.task.start_objects(context) for context in contexts])
         ids = np.arange(count)
         joints = self._kinematics.start(starts)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self._qpos[ids] = joints
+        self._qpos[ids] = np.concatenate([joints, objects.reshape(count, -1)], axis=1)
         self._ctrl[ids] = joints
         self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
         self._episodes = count
-        self._setpoints = starts
-        self._ends = self._tip[ids]
-        self._joints = self._qpos[ids]
-        self._history[0, :count] = self._ends
         self._steps = np.zeros(count, dtype=np.int64)
         self._reasons = [None] * count
         self._done = np.zeros(count, dtype=bool)
+        if self.task.objects:
+            for _ in range(REST_STEPS):
+                _, failed = self._physics(ids)
+                self._end(ids[failed], DIVERGED)
+        self._setpoints = starts
+        self._ends = self._tip[ids]
+        self._positions = self._qpos[ids]
+        self._remember(ids)
         return self._observations()
 
     def step(
@@ -114,20 +125,22 @@ class BatchEnv:
         setpoints = self.task.move(self._setpoints[ids], np.clip(actions, -limit, limit))
         self._ctrl[ids] = self._kinematics.solve(setpoints, self._ctrl[ids])
         touched, failed = self._physics(ids)
-        ends, joints = self._tip[ids], self._qpos[ids]
-        failed |= ~np.isfinite(ends).all(axis=1) | ~np.isfinite(joints).all(axis=1)
+        ends, positions = self._tip[ids], self._qpos[ids]
+        failed |= ~np.isfinite(ends).all(axis=1) | ~np.isfinite(positions).all(axis=1)
         self._end(ids[failed], DIVERGED)
         good = ~failed
-        ids, ends, touched = ids[good], ends[good], touched[good]
+        ids, touched = ids[good], touched[good]
         self._setpoints[ids] = setpoints[good]
-        self._ends[ids] = ends
-        self._joints[ids] = joints[good]
+        self._ends[ids] = ends[good]
+        self._positions[ids] = positions[good]
         self._steps[ids] += 1
-        self._history[self._steps[ids], ids] = ends
+        self._remember(ids)
+        view = self._view(ids)
         # The first reason that holds counts: contact comes before everything else.
-        self._end(ids[touched], COLLISION)
-        self._end(ids[self.task.finished(ends)], FINISHED)
-        self._end(ids[~self.task.inside(ends)], LEFT_WORKSPACE)
+        if self.task.contact_ends:
+            self._end(ids[touched], COLLISION)
+        self._end(ids[self.task.finished(view)], FINISHED)
+        self._end(ids[~self.task.inside(view)], LEFT_WORKSPACE)
         self._end(ids[self._steps[ids] >= self.task.max_steps], TIME_LIMIT)
 
     def _physics(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -157,8 +170,17 @@ class BatchEnv:
                 self._done[index] = True
                 self._reasons[index] = reason
 
+    def _remember(self, ids: NDArray[np.int64]) -> None:
+        """Write the present state of the simulations `ids` into their histories."""
+        self._path_history[self._steps[ids], ids] = self._ends[ids]
+        self._object_history[self._steps[ids], ids] = self.task.object_poses(self._positions[ids])
+
+    def _view(self, ids: NDArray[np.int64]) -> View:
+        objects = self._object_history[self._steps[ids], ids].astype(np.float64)
+        return View(self._setpoints[ids], self._ends[ids], objects)
+
     def _observations(self) -> NDArray[np.float32]:
-        return self.task.observe(self._setpoints, self._ends).astype(np.float32)
+        return self.task.observe(self._view(np.arange(self._episodes))).astype(np.float32)
 
     @property
     def done(self) -> NDArray[np.bool_]:
@@ -173,7 +195,7 @@ class BatchEnv:
     @property
     def qpos(self) -> NDArray[np.float32]:
         """(m, Q) float32 positions of the physics."""
-        return self._joints.astype(np.float32)
+        return self._positions.astype(np.float32)
 
     @property
     def paths(self) -> NDArray[np.float32]:
@@ -188,6 +210,7 @@ class BatchEnv:
                 raise ValueError(
                     f"episode {index} has not ended; step until `done` is true for all"
                 )
-            path = self._history[: self._steps[index] + 1, index]
-            outcomes.append(self.task.outcome(path, reason))
+            rows = slice(self._steps[index] + 1)
+            path, objects = self._path_history[rows, index], self._object_history[rows, index]
+            outcomes.append(self.task.outcome(path, objects, reason))
         return outcomes

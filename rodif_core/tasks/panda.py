@@ -25,11 +25,14 @@ CONTROL_DT = PHYSICS_DT * PHYSICS_STEPS  # 35 ms = 28.57 Hz, as D3IL
 # arm's.
 HOME_QPOS = (0.0, 0.223, 0.0, -2.401, 0.0, 1.054, 0.0)
 
+ARM_JOINTS = 7
 TOOL_BODY = "panda0_link7"
 TOOL_SITE = "rod_tip"  # the end effector of every task with a rod
 ROD_GEOM = "rod"
+TABLE_GEOM = "table"
 CONTACT_SENSOR = "rod_contact"
 ROD_RADIUS = 0.01  # m, as D3IL
+ROD_TIP = 0.30  # m from the tool body along its axis
 
 TOOL_BIT = 2  # contact bits: rod and table carry 2, objects carry 1 and meet both
 OBJECT_BIT = 1
@@ -55,11 +58,12 @@ def panda_files() -> Path:
     return folder
 
 
-def rod_scene(mesh: Mesh = "col") -> mujoco.MjSpec:
+def rod_scene(mesh: Mesh = "col", *, rod_radius: float = ROD_RADIUS) -> mujoco.MjSpec:
     """A table and the Panda with a rod, ready for a task to add its objects.
 
-    mesh  "col": low-poly arm (2,300 faces), fast to draw; "viz": detailed arm (134,000 faces).
-          The physics are the same.
+    mesh        "col": low-poly arm (2,300 faces), fast to draw; "viz": detailed arm (134,000
+                faces). The physics are the same.
+    rod_radius  m; the rod's length is the same for all
     """
     folder = panda_files()
     # The meshdir must follow the include, which sets a relative one.
@@ -73,10 +77,30 @@ def rod_scene(mesh: Mesh = "col") -> mujoco.MjSpec:
     spec.compiler.degree = False
     _set_options(spec)
     _prepare_arm(spec, mesh)
-    _add_rod(spec)
+    _add_rod(spec, rod_radius)
     _add_servos(spec)
     _add_table(spec)
     return spec
+
+
+def add_cube(
+    spec: mujoco.MjSpec, name: str, *, half: float, mass: float, friction: float, rgba: list[float]
+) -> None:
+    """A free cube of half edge `half` (m) and `mass` (kg) that the rod, the table and other objects
+    touch; where it starts is the context's business."""
+    body = spec.worldbody.add_body(name=name, pos=[0.5, 0.0, half])
+    body.add_freejoint(name=f"{name}_joint")
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[half, half, half],
+        mass=mass,
+        rgba=rgba,
+        friction=[friction, 0.005, 0.0001],  # sliding; m of torsion and of rolling
+        condim=4,  # torsion too: a cube that is pushed off its centre turns against friction
+        contype=OBJECT_BIT,
+        conaffinity=OBJECT_BIT | TOOL_BIT,
+    )
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:
@@ -113,13 +137,13 @@ def _prepare_arm(spec: mujoco.MjSpec, mesh: Mesh) -> None:
         joint.armature = 0.1
 
 
-def _add_rod(spec: mujoco.MjSpec) -> None:
+def _add_rod(spec: mujoco.MjSpec, radius: float) -> None:
     flange = spec.body(TOOL_BODY)
     flange.add_geom(
         name=ROD_GEOM,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=[0.0, 0.0, 0.14, 0.0, 0.0, 0.29],
-        size=[ROD_RADIUS, 0.0, 0.0],
+        fromto=[0.0, 0.0, 0.14, 0.0, 0.0, ROD_TIP - radius],
+        size=[radius, 0.0, 0.0],
         mass=0.05,
         rgba=[0.16, 0.18, 0.22, 1.0],
         contype=TOOL_BIT,
@@ -133,7 +157,7 @@ def _add_rod(spec: mujoco.MjSpec) -> None:
         objname=ROD_GEOM,
         intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
     )
-    flange.add_site(name=TOOL_SITE, pos=[0.0, 0.0, 0.30], size=[0.004, 0.0, 0.0], group=4)
+    flange.add_site(name=TOOL_SITE, pos=[0.0, 0.0, ROD_TIP], size=[0.004, 0.0, 0.0], group=4)
 
 
 def _add_servos(spec: mujoco.MjSpec) -> None:
@@ -152,7 +176,7 @@ def _add_servos(spec: mujoco.MjSpec) -> None:
 
 def _add_table(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_geom(
-        name="table",
+        name=TABLE_GEOM,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=[0.35, 0.0, -0.02],
         size=[0.60, 0.60, 0.02],

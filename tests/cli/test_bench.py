@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rodif_core.errors import RodifError, UnknownNameError, ValueOutOfRangeError
-from rodif_core.policies.checkpoint import load_checkpoint, shipped_checkpoint
+from rodif_core.policies.checkpoint import load_checkpoint
+from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import FinetuneMethod, TaskName
 from worker.cli import bench
 from worker.cli.benchmarks import avoid

@@ -9,8 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from labeling_ui.mode_plot import GROUP_COLOURS
+from rodif_core.demonstrations import load_demonstrations
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
+from rodif_core.shipped import shipped_tasks
+from rodif_core.spec import TaskName
 from tests.core.learning import tiny_checkpoint
 from worker.cli.main import main
 from worker.cli.options import number_list
@@ -80,6 +85,71 @@ def test_pretrain_writes_a_checkpoint_with_its_measurements(
     assert made.card["evaluation"]["n"] == 4
     assert made.card["demonstrations"] == 24
     assert made.digest in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path: Path):
+    file = tmp_path / "new.safetensors"
+    sizes = ["--demonstrations", "4", "--updates", "2", "--evaluate", "0"]
+    rounds = ["--rounds", "1", "--recoveries", "4", "--executed-steps", "4"]
+    work = ["--workspace", str(tmp_path / "work")]
+    assert main(["pretrain", "pushing", "--out", str(file), *sizes, *rounds, *work]) == 0
+    made = load_checkpoint(file.read_bytes())
+    assert made.task is TaskName.PUSHING
+    assert made.policy.config.executed_steps == 4
+    assert made.card["start"] is not None
+    assert made.card["demonstrations"] == 4 + made.card["recoveries"]
+
+
+@pytest.mark.parametrize("option", ["--rounds", "--evaluate"])
+def test_pretrain_refuses_negative_numbers(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["pretrain", "avoid", "--out", str(tmp_path / "x"), option, "-1"]) == 1
+    assert "is -1, but must be at least 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", ["pushing", "sorting"])
+def test_evaluate_of_a_task_without_a_checkpoint_names_those_with_one(
+    task: str, capsys: pytest.CaptureFixture[str]
+):
+    if TaskName(task) not in shipped_tasks():
+        assert main(["evaluate", task]) == 1
+        assert "tasks that have one: 'avoid'" in capsys.readouterr().err
+
+
+def test_tasks_lists_every_task_with_its_modes(capsys: pytest.CaptureFixture[str]):
+    assert main(["tasks", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["task"] for row in rows] == [task.value for task in TaskName]
+    assert [row["task"] for row in rows if row["shipped_checkpoint"]] == shipped_tasks()
+    assert all(row["preferred_group"] in row["groups"] for row in rows)
+    assert main(["tasks"]) == 0
+    assert "pushing" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("task", ["avoid", "pushing", "sorting"])
+def test_demos_writes_a_set_that_plot_can_draw(
+    task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file, picture = tmp_path / "set.npz", tmp_path / "modes.png"
+    share = ["--preferred-share", "0.5"]
+    assert main(["demos", task, "--out", str(file), "--n", "4", "--seed", "3", *share]) == 0
+    made = load_demonstrations(file)
+    assert len(made) == 4 and all(one.success and one.info["seed"] == 3 for one in made)
+    assert made[0].outcome["mode"] in capsys.readouterr().out
+    assert main(["plot", "modes", str(file), "--out", str(picture)]) == 0
+    with Image.open(picture) as drawn:
+        colours = {colour for _, colour in drawn.convert("RGB").getcolors(1 << 20)}
+    assert set(GROUP_COLOURS[:2]) <= colours  # both groups of the legend
+
+
+def test_plot_of_a_foreign_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = ["--out", str(tmp_path / "x.png")]
+    assert main(["plot", "modes", str(tmp_path / "none.npz"), *out]) == 1
+    assert "not a readable demonstration set" in capsys.readouterr().err
+    assert main(["plot", "modes", "juggling", *out]) == 1
+    assert "'juggling' is neither a readable file" in capsys.readouterr().err
 
 
 def test_number_list_takes_numbers_and_ranges():

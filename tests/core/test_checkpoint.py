@@ -13,8 +13,8 @@ from rodif_core.policies.checkpoint import (
     FORMAT,
     load_checkpoint,
     save_checkpoint,
-    shipped_checkpoint,
 )
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import TaskName
 from tests.core.learning import tiny_checkpoint
 
@@ -67,10 +67,16 @@ def test_file_of_another_format_names_both_formats() -> None:
         load_checkpoint(data)
 
 
-@pytest.mark.parametrize("task", list(TaskName))
+@pytest.mark.parametrize("task", shipped_tasks())
 def test_shipped_checkpoint_loads_and_tells_what_it_reaches(task: TaskName) -> None:
     checkpoint = load_checkpoint(shipped_checkpoint(task))
     assert checkpoint.task is task
     measured = checkpoint.card["measured"]
     assert measured["n"] >= 500
     assert 0 < measured["success"] <= 1
+
+
+@pytest.mark.parametrize("task", sorted(set(TaskName) - set(shipped_tasks())))
+def test_a_task_without_a_checkpoint_names_those_that_have_one(task: TaskName) -> None:
+    with pytest.raises(CheckpointFileError, match=rf"'{task.value}'.*'avoid'.*rodif pretrain"):
+        shipped_checkpoint(task)

@@ -34,7 +34,7 @@ TASK = AvoidTask()
 @pytest.fixture(scope="module")
 def balanced() -> list[Trajectory]:
     """120 demonstrations, five of each mode."""
-    return make_demonstrations(TASK, episodes=120, seed=3, left_share=0.5)
+    return make_demonstrations(TASK, episodes=120, seed=3, preferred_share=0.5)
 
 
 def same(first: Trajectory, second: Trajectory) -> bool:
@@ -100,7 +100,7 @@ def test_actions_are_within_the_limit_and_move_the_set_point_as_written(
 
 def test_modes_can_be_read_again_from_what_was_stored(balanced: list[Trajectory]) -> None:
     for one in balanced:
-        assert TASK.outcome(one.paths, "finished") == one.outcome
+        assert TASK.outcome(one.paths, TASK.object_poses(one.qpos), "finished") == one.outcome
 
 
 def test_mirrored_actions_drive_through_the_mirrored_mode(balanced: list[Trajectory]) -> None:
@@ -142,24 +142,24 @@ def test_modes_are_balanced_on_each_side(share: float) -> None:
         assert max(here) - min(here) <= 1
 
 
-def test_the_left_share_holds_in_every_part_of_a_set() -> None:
+def test_the_preferred_share_holds_in_every_part_of_a_set() -> None:
     modes = assign_modes(TASK, 100, 0.2)
     for first in range(0, 100, 10):
         assert sum(mode.startswith("L") for mode in modes[first : first + 10]) == 2
 
 
 def test_a_demonstration_that_fails_is_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstrations, "TREMBLE", 0.0035)
-    made = make_demonstrations(TASK, episodes=24, seed=0, left_share=0.5)
+    monkeypatch.setattr(AvoidExpert, "tremble", 0.0035)
+    made = make_demonstrations(TASK, episodes=24, seed=0, preferred_share=0.5)
     assert len(made) == 24 and all(one.success for one in made)
     assert any(one.info["attempt"] > 0 for one in made)
 
 
 def test_an_expert_that_keeps_failing_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstrations, "TREMBLE", 0.2)
+    monkeypatch.setattr(AvoidExpert, "tremble", 0.2)
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
     with pytest.raises(LearningError, match="failed 2 times in mode L-11"):
-        make_demonstrations(TASK, episodes=1, seed=0, left_share=1.0)
+        make_demonstrations(TASK, episodes=1, seed=0, preferred_share=1.0)
 
 
 def test_progress_ends_at_the_whole() -> None:
@@ -173,7 +173,7 @@ def test_progress_ends_at_the_whole() -> None:
     [
         ({"episodes": 0}, "episodes is 0"),
         ({"seed": -1}, "seed is -1"),
-        ({"left_share": 1.5}, r"left_share is 1.5, but must be in \[0, 1\]"),
+        ({"preferred_share": 1.5}, r"preferred_share is 1.5, but must be in \[0, 1\]"),
     ],
 )
 def test_values_out_of_range_are_refused(values: dict[str, Any], message: str) -> None:
@@ -184,23 +184,23 @@ def test_values_out_of_range_are_refused(values: dict[str, Any], message: str) -
 @pytest.mark.parametrize("mode", TASK.modes)
 def test_an_experts_path_keeps_clear_and_runs_in_its_mode(mode: str) -> None:
     for seed in range(5):
-        expert = AvoidExpert.draw(mode, START, np.random.default_rng(seed))
+        expert = AvoidExpert.draw(mode, {"start": START}, np.random.default_rng(seed))
         y = np.linspace(START[1], 0.36, 200)
         path = np.stack([expert.x(y), y], axis=1)
         assert path[0] == pytest.approx(START)
         assert np.abs(np.diff(path[:, 0])).max() < 0.02  # no jumps
         assert expert.clearance() >= MIN_CLEARANCE
-        assert TASK.outcome(path, "finished")["mode"] == mode
+        assert TASK.outcome(path, np.zeros((len(path), 0, 7)), "finished")["mode"] == mode
 
 
 def test_an_expert_of_an_unknown_mode_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="'L-15'.*'L-11'.*'R-34'"):
-        AvoidExpert.draw("L-15", START, np.random.default_rng(0))
+        AvoidExpert.draw("L-15", {"start": START}, np.random.default_rng(0))
 
 
 def test_an_expert_without_a_clear_path_is_reported() -> None:
     with pytest.raises(LearningError, match="no clear path of mode R-11"):
-        AvoidExpert.draw("R-11", (0.5, -0.14), np.random.default_rng(0))
+        AvoidExpert.draw("R-11", {"start": (0.5, -0.14)}, np.random.default_rng(0))
 
 
 def test_a_saved_set_is_read_back_equal(tmp_path: Path, balanced: list[Trajectory]) -> None:

@@ -27,6 +27,7 @@ from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.panda import ROD_RADIUS
 
 TASK = AvoidTask()
+NO_OBJECTS = np.zeros((1, 0, 7))
 LIMIT = TASK.action_limit
 
 
@@ -152,13 +153,13 @@ def test_the_arm_stays_calm_when_it_is_pushed_against_its_reach() -> None:
 
 def test_a_failed_episode_keeps_its_group_but_earns_no_mode() -> None:
     path = np.array([[0.44, -0.28, 0.03], [0.44, -0.10, 0.03], [0.425, 0.03, 0.03]])
-    assert TASK.outcome(path, "collision") == {
+    assert TASK.outcome(path, NO_OBJECTS, "collision") == {
         "success": False,
         "mode": None,
         "group": "left",
         "reason": "collision",
     }
-    assert TASK.outcome(path[:1], "time_limit")["group"] is None
+    assert TASK.outcome(path[:1], NO_OBJECTS, "time_limit")["group"] is None
 
 
 @pytest.mark.parametrize(
@@ -189,7 +190,7 @@ def test_modes_follow_the_rule_worked_by_hand(
             [0.5, FINISH_Y + 0.01],
         ]
     )
-    outcome = TASK.outcome(path, "finished")
+    outcome = TASK.outcome(path, NO_OBJECTS, "finished")
     assert (outcome["success"], outcome["mode"], outcome["group"]) == (True, mode, group)
 
 

@@ -3,22 +3,63 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rodif_core.demonstrations import make_demonstrations
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.spec import TaskName
 from rodif_core.tasks import TASKS, Task, get_task
 from rodif_core.tasks.base import REASONS
 from rodif_core.tasks.env import BatchEnv
+from rodif_core.tasks.experts import draw_expert
+from rodif_core.tasks.panda import ARM_JOINTS
+from rodif_core.trajectory import Trajectory
 
 TASK_PARAMS = [pytest.param(task, id=name.value) for name, task in TASKS.items()]
 STEPS = 12
 
 pytestmark = pytest.mark.parametrize("task", TASK_PARAMS)
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The scene's plane of symmetry x = `x` (m), and what it does to a mode."""
+
+    x: float
+    mode: Callable[[str], str]
+
+
+def mirrored_gaps(mode: str) -> str:
+    return f"{'R' if mode[0] == 'L' else 'L'}-{4 - int(mode[2])}{5 - int(mode[3])}"
+
+
+# Where there are two cubes and two places for them, the mirror also exchanges their colours.
+MIRRORS = {
+    TaskName.AVOID: Mirror(0.5, mirrored_gaps),
+    TaskName.PUSHING: Mirror(0.525, lambda m: m.translate(str.maketrans("rg", "gr"))),
+    TaskName.SORTING: Mirror(0.5125, lambda m: "-".join(reversed(m.split("-")))),
+}
+
+
+@cache
+def demonstrations_of(task: Task) -> list[Trajectory]:
+    """At least 24 demonstrations, the same number in every mode."""
+    per_mode = max(1, 24 // len(task.modes))
+    liked = sum(task.group_of(mode) == task.preferred_group for mode in task.modes)
+    return make_demonstrations(
+        task,
+        episodes=per_mode * len(task.modes),
+        seed=2,
+        preferred_share=liked / len(task.modes),
+    )
 
 
 def contexts_of(task: Task, seeds: Sequence[int]) -> list[dict[str, Any]]:
@@ -187,6 +228,69 @@ def test_an_episode_that_gets_nowhere_ends_at_the_time_limit(task: Task) -> None
     ]
 
 
+def test_every_mode_is_reached_by_its_expert(task: Task) -> None:
+    made = demonstrations_of(task)
+    assert Counter(one.outcome["mode"] for one in made) == dict.fromkeys(
+        task.modes, len(made) // len(task.modes)
+    )
+    for one in made:
+        assert one.success and one.outcome["mode"] == one.info["expert"]["mode"]
+        assert one.outcome["group"] == task.group_of(one.outcome["mode"])
+
+
+def test_at_least_95_percent_of_first_draws_succeed_in_the_wanted_mode(task: Task) -> None:
+    attempts = [one.info["attempt"] for one in demonstrations_of(task)]
+    assert attempts.count(0) / len(attempts) >= 0.95
+
+
+def test_outcomes_can_be_read_again_from_what_was_stored(task: Task) -> None:
+    for one in demonstrations_of(task):
+        objects = task.object_poses(one.qpos)
+        assert task.outcome(one.paths, objects, one.outcome["reason"]) == one.outcome
+
+
+def test_a_mirrored_trajectory_has_the_mirrored_mode(task: Task) -> None:
+    mirror = MIRRORS[task.name]
+    for one in demonstrations_of(task):
+        path, objects = one.paths.astype(np.float64), task.object_poses(one.qpos).copy()
+        path[:, 0] = 2 * mirror.x - path[:, 0]
+        objects[..., 0] = 2 * mirror.x - objects[..., 0]
+        objects[..., 3:] *= (1, 1, -1, -1)  # rotations about y and z turn the other way
+        objects = objects[:, ::-1]  # the two cubes change colours
+        found = task.outcome(path, objects, one.outcome["reason"])
+        assert found["mode"] == mirror.mode(one.outcome["mode"])
+
+
+def test_demonstrations_played_again_give_the_same_bits(task: Task) -> None:
+    one = demonstrations_of(task)[0]
+    env = BatchEnv(task, 1)
+    observations = [env.reset([one.context])]
+    observations += [env.step(action[None]) for action in one.actions]
+    assert np.concatenate(observations).tobytes() == one.observations.tobytes()
+    assert env.outcomes() == [one.outcome]
+
+
+def test_an_expert_of_an_unknown_mode_is_refused(task: Task) -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(UnknownNameError, match=f"'sideways'.*'{task.modes[0]}'"):
+        draw_expert(task.name, "sideways", task.sample_context(rng), rng)
+
+
+def test_a_context_without_its_values_is_refused(task: Task) -> None:
+    whole = contexts_of(task, [1])[0]
+    for name in whole:
+        with pytest.raises(ValueOutOfRangeError, match=f"{name} is None, but must be "):
+            BatchEnv(task, 1).reset([{k: v for k, v in whole.items() if k != name}])
+
+
+def test_the_model_has_the_arm_first_and_then_the_objects(task: Task) -> None:
+    model = task.build_model()
+    assert model.nq == ARM_JOINTS + 7 * len(task.objects)
+    for index, name in enumerate(task.objects):
+        joint = model.body(name).jntadr[0]
+        assert model.jnt_qposadr[joint] == ARM_JOINTS + 7 * index
+
+
 def test_outcomes_are_refused_before_all_episodes_have_ended(task: Task) -> None:
     env = BatchEnv(task, 1)
     env.reset(contexts_of(task, [1]))
@@ -253,4 +357,4 @@ def test_an_unknown_task_is_refused_with_the_legal_names(task: Task) -> None:
 
 def test_an_unknown_reason_is_refused(task: Task) -> None:
     with pytest.raises(UnknownNameError, match=f"'tired'.*'{REASONS[0]}'"):
-        task.outcome(np.zeros((1, 3)), "tired")
+        task.outcome(np.zeros((1, 3)), np.zeros((1, len(task.objects), 7)), "tired")

@@ -11,15 +11,15 @@ from rodif_core.policies.checkpoint import (
     CheckpointFileError,
     load_checkpoint,
     save_checkpoint,
-    shipped_checkpoint,
 )
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import TaskName
 from server.settings import Settings
 from server.store.session import Database
 from server.store.tables import Annotator, Campaign, Checkpoint
 from tests.core.learning import tiny_checkpoint
 from worker import prepare as preparing
-from worker.prepare import Prepared, prepare, shipped_bytes
+from worker.prepare import Prepared, prepare
 
 TINY = save_checkpoint(tiny_checkpoint())
 
@@ -33,7 +33,7 @@ def first_time(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Prepared
     """A folder prepared once; a tiny policy stands for the shipped one."""
     folder = tmp_path_factory.mktemp("first")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preparing, "shipped_bytes", lambda _task: TINY)
+        patch.setattr(preparing, "shipped_checkpoint", lambda _task: TINY)
         return folder, prepare(_settings(folder))
 
 
@@ -42,7 +42,7 @@ def settings(
     first_time: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Settings:
     """A copy of the prepared folder."""
-    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: TINY)
+    monkeypatch.setattr(preparing, "shipped_checkpoint", lambda _task: TINY)
     shutil.copytree(first_time[0], tmp_path / "state")
     return _settings(tmp_path / "state")
 
@@ -89,7 +89,7 @@ def test_newer_shipped_checkpoint_is_added_beside_the_old_one(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     newer = save_checkpoint(tiny_checkpoint(seed=1))
-    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: newer)
+    monkeypatch.setattr(preparing, "shipped_checkpoint", lambda _task: newer)
     prepare(settings)
     _, checkpoints, (campaign,) = _rows(settings)
     assert len(checkpoints) == 2
@@ -100,12 +100,11 @@ def test_damaged_shipped_checkpoint_is_refused(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     damaged = save_checkpoint(tiny_checkpoint())[:-40]
-    monkeypatch.setattr(preparing, "shipped_bytes", lambda _task: damaged)
+    monkeypatch.setattr(preparing, "shipped_checkpoint", lambda _task: damaged)
     with pytest.raises(CheckpointFileError, match="not a readable checkpoint"):
         prepare(settings)
 
 
-@pytest.mark.parametrize("task", list(TaskName))
-def test_what_is_registered_is_what_is_shipped(task: TaskName) -> None:
-    assert shipped_bytes(task) == shipped_checkpoint(task)
-    assert load_checkpoint(shipped_bytes(task)).task == task
+@pytest.mark.parametrize("task", shipped_tasks())
+def test_a_shipped_checkpoint_is_of_its_task(task: TaskName) -> None:
+    assert load_checkpoint(shipped_checkpoint(task)).task == task

@@ -59,7 +59,8 @@ def make_missing(runs: Sequence[avoid.Run], path: Path, workers: int) -> list[Ro
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from rodif_core.policies.checkpoint import load_checkpoint, shipped_checkpoint
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.shipped import shipped_checkpoint
 
     rows = read_rows(path)
     digest = load_checkpoint(shipped_checkpoint(TaskName.AVOID)).digest

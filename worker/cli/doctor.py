@@ -160,15 +160,19 @@ def check_database(settings: Settings) -> Finding:
 
 
 def check_checkpoint() -> Finding:
-    """The pretrained checkpoint that comes with the package can be read."""
-    from rodif_core.policies.checkpoint import load_checkpoint, shipped_checkpoint
-    from rodif_core.spec import TaskName
+    """The pretrained checkpoints that come with the package can be read."""
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 
+    advice = "install the project again"
     try:
-        checkpoint = load_checkpoint(shipped_checkpoint(TaskName.AVOID))
+        found = {task: load_checkpoint(shipped_checkpoint(task)) for task in shipped_tasks()}
     except RodifError as error:
-        return Finding("checkpoint", "fail", str(error), "install the project again")
-    return Finding("checkpoint", "ok", f"avoid {checkpoint.digest[:12]}")
+        return Finding("checkpoint", "fail", str(error), advice)
+    if not found:
+        return Finding("checkpoint", "fail", "no task has a shipped checkpoint", advice)
+    names = ", ".join(f"{task.value} {one.digest[:12]}" for task, one in found.items())
+    return Finding("checkpoint", "ok", names)
 
 
 def check_disk(settings: Settings) -> Finding:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from rodif_core.errors import CheckpointFileError
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
 
 
@@ -15,14 +16,12 @@ def read_checkpoint(name: str) -> bytes:
 
     Raises CheckpointFileError when it is neither.
     """
-    from rodif_core.policies.checkpoint import shipped_checkpoint
-
     if name in list(TaskName):
         return shipped_checkpoint(TaskName(name))
     try:
         return Path(name).read_bytes()
     except OSError as error:
-        tasks = ", ".join(repr(task.value) for task in TaskName)
+        tasks = ", ".join(repr(task.value) for task in shipped_tasks())
         raise CheckpointFileError(
             f"{name!r} is neither a readable file ({error.strerror}) nor a task with a shipped"
             f" checkpoint: {tasks}"

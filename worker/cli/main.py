@@ -7,14 +7,30 @@ import sys
 from collections.abc import Sequence
 
 from rodif_core.errors import RodifError
-from worker.cli import bench, demo, doctor, evaluate, migrate, pretrain, round, simulate, up
+from worker.cli import (
+    bench,
+    demo,
+    demos,
+    doctor,
+    evaluate,
+    migrate,
+    plot,
+    pretrain,
+    round,
+    simulate,
+    tasks,
+    up,
+)
 
 COMMANDS = {
     "up": up,
     "demo": demo,
     "simulate": simulate,
     "round": round,
+    "tasks": tasks,
     "evaluate": evaluate,
+    "plot": plot,
+    "demos": demos,
     "pretrain": pretrain,
     "bench": bench,
     "doctor": doctor,

@@ -5,10 +5,18 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
 
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from rodif_core.policies.checkpoint import Checkpoint
+    from rodif_core.pretrain import PretrainConfig
+
+RECOVERY_SEEDS = 500_000_000  # first seed of takeovers
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.pretrain, which the help does not load
 
 
@@ -20,9 +28,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--preset", choices=PRESET_NAMES, default="cpu")
     parser.add_argument("--demonstrations", type=int, default=2000)
     parser.add_argument(
-        "--left-share", type=float, help="share of demonstrations on the left (default: the task's)"
+        "--preferred-share",
+        "--left-share",
+        type=float,
+        help="share of demonstrations in the preferred group, for avoid: on the left"
+        " (default: the task's)",
     )
     parser.add_argument("--updates", type=int, help="default: the preset's")
+    parser.add_argument(
+        "--executed-steps", type=int, help="control steps between two decisions (default: preset's)"
+    )
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        default=0,
+        help="after the first training, let the expert take over from the policy, and train on"
+        " that too, so many times (default %(default)s)",
+    )
+    parser.add_argument(
+        "--recoveries", type=int, default=300, help="takeovers tried a round (default %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default %(default)s)")
     parser.add_argument(
@@ -34,61 +59,92 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Demonstrate, train, measure, write."""
-    if args.evaluate < 0:
-        raise ValueOutOfRangeError("evaluate", args.evaluate, "at least 0")
+    """Demonstrate, train, let the expert take over and train again, measure, write."""
+    for name, least in (("evaluate", 0), ("rounds", 0), ("recoveries", 1)):
+        if getattr(args, name) < least:
+            raise ValueOutOfRangeError(name, getattr(args, name), f"at least {least}")
 
     from rich.console import Console
     from rich.progress import Progress
 
-    from rodif_core.demonstrations import DEFAULT_LEFT_SHARE, make_demonstrations
-    from rodif_core.evaluate import evaluate
     from rodif_core.policies.checkpoint import save_checkpoint
-    from rodif_core.pretrain import preset_for, pretrain
-    from rodif_core.tasks import get_task
-    from worker.cli.tables import evaluation_table
+    from rodif_core.pretrain import preset_for
 
     task_name = TaskName(args.task)
     config = replace(preset_for(task_name, args.preset), seed=args.seed)
     if args.updates is not None:
         config = replace(config, updates=args.updates)
-    if args.workspace is not None:
-        args.workspace.mkdir(parents=True, exist_ok=True)
+    if args.executed_steps is not None:
+        config = replace(config, executed_steps=args.executed_steps)
     console = Console(stderr=True)
     with Progress(console=console) as bar:
-        making = bar.add_task("demonstrations", total=args.demonstrations)
-        demonstrations = make_demonstrations(
-            get_task(task_name),
-            episodes=args.demonstrations,
-            seed=args.seed,
-            left_share=DEFAULT_LEFT_SHARE if args.left_share is None else args.left_share,
-            progress=lambda done, _: bar.update(making, completed=done),
-        )
-        training = bar.add_task("training", total=config.updates)
-
-        def show(done: int, _: int, metrics: dict[str, float]) -> None:
-            losses = ", ".join(f"{name} {value:.4f}" for name, value in metrics.items())
-            bar.update(training, completed=done, description=f"training ({losses})")
-
-        checkpoint = pretrain(
-            task_name,
-            demonstrations,
-            config,
-            workspace=args.workspace,
-            device=args.device,
-            progress=show,
-        )
+        checkpoint = _train(args, config, bar)
         if args.evaluate:
-            rolling = bar.add_task("rollouts", total=args.evaluate)
-            measured = evaluate(
-                checkpoint,
-                RolloutConfig(episodes=args.evaluate),
-                progress=lambda done, _: bar.update(rolling, completed=done),
-            ).to_json()
-            kept = {k: v for k, v in measured.items() if k not in ("paths", "path_groups")}
-            checkpoint = replace(checkpoint, card=checkpoint.card | {"evaluation": kept})
-            console.print(evaluation_table(f"{task_name.value}, seed 0 on", [("new", measured)]))
+            checkpoint = _measure(checkpoint, args.evaluate, bar)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_bytes(save_checkpoint(checkpoint))
     print(f"{args.out}  {args.out.stat().st_size} bytes  digest {checkpoint.digest}")
     return 0
+
+
+def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> Checkpoint:
+    """The first training and `args.rounds` more, each on all that experts have shown so far."""
+    from rodif_core.demonstrations import make_demonstrations
+    from rodif_core.pretrain import pretrain
+    from rodif_core.recoveries import make_recoveries
+    from rodif_core.tasks import get_task
+
+    making = bar.add_task("demonstrations", total=args.demonstrations)
+    shown = make_demonstrations(
+        get_task(args.task),
+        episodes=args.demonstrations,
+        seed=args.seed,
+        preferred_share=args.preferred_share,
+        progress=lambda done, _: bar.update(making, completed=done),
+    )
+    checkpoint = None
+    for number in range(args.rounds + 1):
+        if checkpoint is not None:
+            # Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
+            shown += make_recoveries(
+                checkpoint, episodes=args.recoveries, seed=RECOVERY_SEEDS + args.seed + number
+            )
+        training = bar.add_task(f"training {number}", total=config.updates)
+
+        def show(done: int, _: int, metrics: dict[str, float], row: TaskID = training) -> None:
+            losses = ", ".join(f"{name} {value:.4f}" for name, value in metrics.items())
+            bar.update(row, completed=done, description=f"training ({losses})")
+
+        workspace = None
+        if args.workspace is not None:
+            workspace = args.workspace / f"round-{number}"
+            workspace.mkdir(parents=True, exist_ok=True)
+        checkpoint = pretrain(
+            TaskName(args.task),
+            shown,
+            config,
+            start=checkpoint,
+            workspace=workspace,
+            device=args.device,
+            progress=show,
+        )
+    assert checkpoint is not None
+    facts = {"rounds": args.rounds, "recoveries": len(shown) - args.demonstrations}
+    return replace(checkpoint, card=checkpoint.card | facts)
+
+
+def _measure(checkpoint: Checkpoint, episodes: int, bar: Progress) -> Checkpoint:
+    """The same checkpoint with a measurement on its card."""
+    from rodif_core.evaluate import evaluate
+    from worker.cli.tables import evaluation_table
+
+    rolling = bar.add_task("rollouts", total=episodes)
+    measured = evaluate(
+        checkpoint,
+        RolloutConfig(episodes=episodes),
+        progress=lambda done, _: bar.update(rolling, completed=done),
+    ).to_json()
+    kept = {k: v for k, v in measured.items() if k not in ("paths", "path_groups")}
+    table = evaluation_table(f"{checkpoint.task.value}, seed 0 on", [("new", measured)])
+    bar.console.print(table)
+    return replace(checkpoint, card=checkpoint.card | {"evaluation": kept})

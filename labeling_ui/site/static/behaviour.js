@@ -75,13 +75,14 @@ export function pathMap(title, evaluation, facts) {
   const picture = svg(
     "svg",
     { viewBox: `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`, role: "img", "aria-label": `${title}: ${paths.length} paths seen from above` },
-    [...facts.scene].sort(workspaceFirst).map(sceneShape), paths,
+    [...facts.scene].sort(groundFirst).map(sceneShape), paths,
   );
   const caption = evaluation ? `${title} · ${paths.length} of ${evaluation.n} runs` : title;
   return element("figure", {}, element("figcaption", {}, caption), picture);
 }
 
-const workspaceFirst = (one, other) => (other.type === "workspace") - (one.type === "workspace");
+const GROUND = ["workspace", "platform", "target"];
+const groundFirst = (one, other) => GROUND.includes(other.type) - GROUND.includes(one.type);
 
 function sceneShape(shape) {
   if (shape.type === "cylinder") {
@@ -94,6 +95,23 @@ function sceneShape(shape) {
   if (shape.type === "workspace") {
     const size = { width: shape.x1 - shape.x0, height: shape.y1 - shape.y0 };
     return svg("rect", { x: shape.x0, y: -shape.y1, ...size, fill: "none", stroke: "var(--line)", "stroke-width": 0.003 });
+  }
+  if (shape.type === "platform") {
+    const size = { width: shape.x1 - shape.x0, height: shape.y1 - shape.y0 };
+    return svg("rect", { x: shape.x0, y: -shape.y1, ...size, fill: "var(--line)", "fill-opacity": 0.4 });
+  }
+  if (shape.type === "target") {
+    const size = { width: 2 * shape.half_x, height: 2 * shape.half_y };
+    return svg("rect", {
+      x: shape.x - shape.half_x, y: -shape.y - shape.half_y, ...size,
+      fill: shape.colour, "fill-opacity": 0.15, stroke: shape.colour, "stroke-width": 0.003,
+    });
+  }
+  if (shape.type === "cube") { // somewhere in its start range, so only an outline
+    return svg("rect", {
+      x: shape.x - shape.half, y: -shape.y - shape.half, width: 2 * shape.half, height: 2 * shape.half,
+      fill: "none", stroke: shape.colour, "stroke-width": 0.004, "stroke-dasharray": "0.012 0.008",
+    });
   }
   if (shape.type === "start") {
     return svg("circle", { cx: shape.x, cy: -shape.y, r: 0.009, fill: "none", stroke: "var(--muted)", "stroke-width": 0.003 });

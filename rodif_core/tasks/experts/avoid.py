@@ -8,13 +8,14 @@ path and goes there at its own speed, so it steers back whenever its hand trembl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import LearningError, UnknownNameError
 from rodif_core.tasks.avoid import FINISH_Y, ROWS, START, AvoidTask
+from rodif_core.tasks.base import Context
 from rodif_core.tasks.panda import ROD_RADIUS
 
 Array = NDArray[np.float64]
@@ -33,8 +34,6 @@ MIN_CLEARANCE = 0.008  # m between rod and cylinder, everywhere on the path
 MAX_DRAWS = 200  # of one path; measured: the hardest modes need about 1
 LOOK_AHEAD = 0.03  # m along the path
 SPEEDS = (0.0088, 0.0116)  # m per control step, a draw per episode; D3IL's stick was at 0.0125
-TREMBLE = 0.0008  # m per control step: standard deviation of the hand's noise on each axis
-TREMBLE_MEMORY = 0.8  # share of the noise that stays from one control step to the next
 
 
 @dataclass(frozen=True)
@@ -45,15 +44,17 @@ class AvoidExpert:
     knots_x: tuple[float, ...]  # m; start, three crossings, exit
     knots_y: tuple[float, ...]  # m
     speed: float  # m per control step
+    tremble: ClassVar[float] = 0.0008  # m per control step: standard deviation of the hand's noise
 
     @classmethod
-    def draw(cls, mode: str, start: tuple[float, float], rng: np.random.Generator) -> AvoidExpert:
-        """Draw a path of that mode from `start` (x, y in metres) which is clear of all cylinders.
+    def draw(cls, mode: str, context: Context, rng: np.random.Generator) -> AvoidExpert:
+        """Draw a path of that mode from the context's start which is clear of all cylinders.
 
         Raises UnknownNameError for a mode that is not one of the task's 24.
         """
         if mode not in AvoidTask.modes:
             raise UnknownNameError("mode", mode, AvoidTask.modes)
+        start = context["start"]
         gaps = ("LR".index(mode[0]), int(mode[2]) - 1, int(mode[3]) - 1)
         rows_y = [row[0][1] for row in ROWS]
         if gaps[2] in (0, 3):
@@ -123,5 +124,5 @@ class AvoidExpert:
             "knots_x": list(self.knots_x),
             "knots_y": list(self.knots_y),
             "speed": self.speed,
-            "tremble": TREMBLE,
+            "tremble": self.tremble,
         }

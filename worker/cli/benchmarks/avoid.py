@@ -124,7 +124,8 @@ def execute(run: Run) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=1)
 def _shipped() -> Checkpoint:
-    from rodif_core.policies.checkpoint import load_checkpoint, shipped_checkpoint
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.shipped import shipped_checkpoint
 
     return load_checkpoint(shipped_checkpoint(TaskName.AVOID))
 

@@ -1,0 +1,84 @@
+"""Takeovers by the expert from a policy."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from rodif_core import recoveries
+from rodif_core.demonstrations import make_demonstrations
+from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
+from rodif_core.policies.unet import UnetSize
+from rodif_core.pretrain import PretrainConfig, pretrain
+from rodif_core.recoveries import make_recoveries
+from rodif_core.shipped import shipped_checkpoint
+from rodif_core.spec import TaskName
+from rodif_core.tasks import get_task
+from rodif_core.tasks.experts.pushing import PushingExpert
+from rodif_core.trajectory import Trajectory
+
+
+@functools.cache
+def beginner() -> Checkpoint:
+    """A policy for Pushing that has hardly learnt."""
+    config = PretrainConfig(size=UnetSize(channels=(8, 16)), updates=3, batch_size=8)
+    demonstrations = make_demonstrations(get_task("pushing"), episodes=4, seed=0)
+    return pretrain(TaskName.PUSHING, demonstrations, config)
+
+
+@functools.cache
+def recovered() -> list[Trajectory]:
+    return make_recoveries(beginner(), episodes=6, seed=5)
+
+
+def test_a_recovery_begins_where_the_expert_took_over_and_succeeds() -> None:
+    task = get_task("pushing")
+    assert len(recovered()) >= 3
+    for one in recovered():
+        assert one.success and one.outcome["mode"] in task.modes
+        assert 1 <= one.info["taken_over_at"] < task.max_steps
+        assert one.info["taken_over_at"] + len(one.actions) <= task.max_steps
+        assert one.info["checkpoint"] == beginner().digest
+        assert len(one.decision_steps) == 0
+
+
+def test_the_actions_of_a_recovery_are_the_experts() -> None:
+    for one in recovered():
+        expert = PushingExpert(one.info["expert"]["mode"])
+        for seen, done in zip(one.observations[:-1], one.actions, strict=True):
+            np.testing.assert_allclose(done, expert.act(seen), atol=1e-6)
+
+
+def test_a_recovery_depends_on_its_seed_and_index_alone() -> None:
+    again = make_recoveries(beginner(), episodes=6, seed=5)
+    assert [one.to_bytes() for one in again] == [one.to_bytes() for one in recovered()]
+    other = make_recoveries(beginner(), episodes=2, seed=6)
+    assert other[0].context != recovered()[0].context
+
+
+def test_the_expert_goes_on_in_the_mode_that_the_policy_was_after() -> None:
+    """A policy that is good at Avoid is taken over after it has chosen a side."""
+    made = make_recoveries(load_checkpoint(shipped_checkpoint(TaskName.AVOID)), episodes=30, seed=1)
+    late = [one for one in made if one.paths[0, 1] > 0.0]
+    assert len(late) >= 3
+    for one in late:
+        assert one.outcome["mode"][2:] == one.info["expert"]["mode"][2:]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"episodes": 0, "seed": 0}, "episodes is 0"), ({"episodes": 1, "seed": -1}, "seed is -1")],
+)
+def test_values_out_of_range_are_refused(values: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=message):
+        make_recoveries(beginner(), **values)
+
+
+def test_recoveries_do_not_depend_on_how_many_run_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recoveries, "PARALLEL", 2)
+    again = make_recoveries(beginner(), episodes=3, seed=5)
+    both = [one for one in recovered() if one.info["index"] < 3]
+    assert [one.context for one in again] == [one.context for one in both]

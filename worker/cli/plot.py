@@ -1,0 +1,64 @@
+"""`rodif plot`: pictures of what a policy or a set of demonstrations does."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rodif_core.spec import RolloutConfig
+from worker.cli.evaluate import read_checkpoint
+
+if TYPE_CHECKING:
+    from rodif_core.trajectory import Trajectory
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command's arguments."""
+    parser = subparsers.add_parser("plot", help="draw end-effector paths, coloured by mode")
+    parser.add_argument("what", choices=["modes"])
+    parser.add_argument(
+        "source",
+        help="a .safetensors file, a task: its shipped checkpoint, or a file of `rodif demos`",
+    )
+    parser.add_argument("--out", type=Path, required=True, help="file to write (png)")
+    parser.add_argument("--n", type=int, default=100, help="paths (default %(default)s)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="rollout i uses SEED + i (default %(default)s)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Roll out or read, draw, write."""
+    config = RolloutConfig(episodes=args.n, seed=args.seed)
+
+    from labeling_ui.mode_plot import mode_plot
+    from rodif_core.tasks import get_task
+
+    episodes = _episodes(args.source, config)
+    task = get_task(str(episodes[0].info["task"]))
+    title = f"{task.name.value}, {len(episodes)} paths of {Path(args.source).name}"
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_bytes(mode_plot(task, title, episodes))
+    print(args.out)
+    return 0
+
+
+def _episodes(source: str, config: RolloutConfig) -> Sequence[Trajectory]:
+    """The first demonstrations of a set, or rollouts of a checkpoint with a progress bar."""
+    if source.endswith(".npz"):
+        from rodif_core.demonstrations import load_demonstrations
+
+        return load_demonstrations(Path(source))[: config.episodes]
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.rollout import rollout
+
+    checkpoint = load_checkpoint(read_checkpoint(source))
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        row = bar.add_task("rollouts", total=config.episodes)
+        return rollout(checkpoint, config, progress=lambda done, _: bar.update(row, completed=done))

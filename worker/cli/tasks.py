@@ -1,0 +1,67 @@
+"""`rodif tasks`: what can be rolled out, and in which modes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command's arguments."""
+    parser = subparsers.add_parser("tasks", help="list the robot tasks")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def facts() -> list[dict[str, Any]]:
+    """One row a task, as JSON types."""
+    from rodif_core.shipped import shipped_tasks
+    from rodif_core.tasks import TASKS
+
+    return [
+        {
+            "task": name.value,
+            "observation_dim": task.observation_dim,
+            "action_dim": task.action_dim,
+            "action_limit": task.action_limit,
+            "control_dt": task.control_dt,
+            "max_steps": task.max_steps,
+            "objects": list(task.objects),
+            "modes": list(task.modes),
+            "groups": list(task.groups),
+            "preferred_group": task.preferred_group,
+            "criterion": task.criterion,
+            "shipped_checkpoint": name in shipped_tasks(),
+        }
+        for name, task in TASKS.items()
+    ]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table or the JSON."""
+    rows = facts()
+    if args.json:
+        print(json.dumps(rows))
+        return 0
+
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(caption="observation and action: dims; limit: mm per control step and axis")
+    for heading in ("task", "observation", "action", "limit", "steps", "modes", "preferred"):
+        table.add_column(heading)
+    table.add_column("shipped checkpoint")
+    for row in rows:
+        modes = ", ".join(row["modes"]) if len(row["modes"]) <= 4 else str(len(row["modes"]))
+        table.add_row(
+            row["task"],
+            str(row["observation_dim"]),
+            str(row["action_dim"]),
+            f"{1000 * row['action_limit']:g}",
+            str(row["max_steps"]),
+            modes,
+            row["preferred_group"],
+            "yes" if row["shipped_checkpoint"] else "no",
+        )
+    Console().print(table)
+    return 0
