@@ -47,19 +47,19 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(caption="observation and action: dims; limit: mm per control step and axis")
-    for heading in ("task", "observation", "action", "limit", "steps", "modes", "preferred"):
-        table.add_column(heading)
-    table.add_column("shipped checkpoint")
+    table = Table(
+        caption="obs and act: dims; limit: mm per control step and axis; --json names the modes"
+    )
+    for heading in ("task", "obs", "act", "limit", "steps", "modes", "preferred", "shipped"):
+        table.add_column(heading, no_wrap=True)
     for row in rows:
-        modes = ", ".join(row["modes"]) if len(row["modes"]) <= 4 else str(len(row["modes"]))
         table.add_row(
             row["task"],
             str(row["observation_dim"]),
             str(row["action_dim"]),
             f"{1000 * row['action_limit']:g}",
             str(row["max_steps"]),
-            modes,
+            str(len(row["modes"])),
             row["preferred_group"],
             "yes" if row["shipped_checkpoint"] else "no",
         )
