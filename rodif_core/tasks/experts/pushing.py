@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rodif_core.errors import UnknownNameError
 from rodif_core.tasks.base import Array
-from rodif_core.tasks.experts.push import steer
+from rodif_core.tasks.experts.push import HAND_TREMBLE, steer
 from rodif_core.tasks.pushing import MODES, TARGETS
 
 # m from its target at which a cube is left alone. At half of that three in four demonstrations went
@@ -27,7 +27,7 @@ class PushingExpert:
     """
 
     mode: str
-    tremble: ClassVar[float] = 0.0008  # m per control step: standard deviation of the hand's noise
+    tremble: ClassVar[float] = HAND_TREMBLE
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rodif_core.errors import UnknownNameError
 from rodif_core.tasks.base import Array
-from rodif_core.tasks.experts.push import steer
+from rodif_core.tasks.experts.push import HAND_TREMBLE, steer
 from rodif_core.tasks.sorting import BIN_Y, SortingTask, edge_point
 
 OVER_THE_EDGE = BIN_Y[0] + 0.012  # m; a cube whose centre is there falls
@@ -25,7 +25,7 @@ class SortingExpert:
     """
 
     mode: str
-    tremble: ClassVar[float] = 0.0008  # m per control step: standard deviation of the hand's noise
+    tremble: ClassVar[float] = HAND_TREMBLE
 
     def __post_init__(self) -> None:
         if self.mode not in SortingTask.modes:
