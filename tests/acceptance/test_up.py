@@ -41,7 +41,7 @@ def _up(state: Path, output: Path) -> Iterator[tuple[subprocess.Popen[bytes], st
     finally:
         if process.poll() is None:
             process.terminate()
-        process.wait(timeout=30)
+        process.wait(timeout=120)
 
 
 def _address(printed: str) -> str:
@@ -70,7 +70,7 @@ def test_up_starts_signs_in_refuses_a_second_one_stops_cleanly_and_starts_again(
         family = psutil.Process(process.pid).children(recursive=True)
         assert len(family) >= 6  # broker, API, worker and its child, ticker, beat
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=120) == 0
         _, alive = psutil.wait_procs(family, timeout=5)
         assert alive == []
 
@@ -80,4 +80,4 @@ def test_up_starts_signs_in_refuses_a_second_one_stops_cleanly_and_starts_again(
             api.sign_in(name, password)
             assert api.find_campaign(None)["id"] == campaign["id"]
         process.send_signal(signal.SIGINT)  # Ctrl-C
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=120) == 0

@@ -18,7 +18,10 @@ export class Transport {
     find("#back").addEventListener("click", () => this.step(-1));
     find("#forward").addEventListener("click", () => this.step(1));
     this.scrubber.addEventListener("pointerdown", () => { this.dragging = true; });
-    this.scrubber.addEventListener("pointerup", () => { this.dragging = false; });
+    this.scrubber.addEventListener("pointerup", () => {
+      this.dragging = false;
+      this.scrubber.blur(); // after a mouse drag the arrow keys judge; whoever tabs here seeks with them
+    });
     this.scrubber.addEventListener("change", () => { this.dragging = false; });
     this.scrubber.addEventListener("input", () => this.seek(Number(this.scrubber.value)));
     this.speed.addEventListener("change", () => this.setSpeed(Number(this.speed.value)));
