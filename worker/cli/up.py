@@ -41,6 +41,7 @@ def run(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -
     settings = settings_from(args)
     password = environment.get("RODIF_ADMIN_PASSWORD") or None
     signal.signal(signal.SIGTERM, _like_ctrl_c)
+    signal.signal(signal.SIGINT, _like_ctrl_c)  # a shell script's "&" would have it ignored
     print(f"Starting in {settings.state_dir} …", flush=True)
     with running_system(settings, workers=args.workers, admin_password=password) as system:
         print(f"\nRoDiF Studio is ready at {system.url}")
