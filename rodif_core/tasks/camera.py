@@ -77,6 +77,10 @@ class Camera:
         """Names of the scene's cameras."""
         return [self._model.camera(i).name for i in range(self._model.ncam)]
 
+    def check(self) -> None:
+        """Make the OpenGL context, as the first picture would; raises GraphicsError."""
+        self._begin()
+
     def picture(
         self,
         qpos: NDArray[np.floating[Any]],
