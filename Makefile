@@ -18,8 +18,8 @@ setup: ## Install what the system needs into .venv
 setup-dev:
 	@scripts/setup.sh dev
 
-demo: setup ## The whole loop on Avoid, then the site. ARGS="--headless --json out.json" ends by itself
-	@$(BIN)/rodif demo $(ARGS)
+demo: setup ## The whole loop on TASK (avoid), then the site. ARGS="--headless --json out.json" ends by itself
+	@$(BIN)/rodif demo $(TASK) $(ARGS)
 
 up: setup ## Start the embedded system and leave it running. ARGS="--port 8080"
 	@$(BIN)/rodif up $(ARGS)

@@ -19,6 +19,7 @@ from rodif_core.trajectory import Trajectory
 
 PERCENTILE = 0.99
 VOXEL = 0.03  # edge of the thinning grid, normalised units: well below the threshold it yields
+MAX_POINTS = 8192  # kept at most: in 20 dimensions a voxel holds one state, and thins nothing
 _CHUNK = 2048  # rows of the distance matrix held at once
 
 
@@ -34,14 +35,29 @@ def nearest_distance(points: Tensor, states: Tensor) -> Tensor:
 
 
 def fit_support(known: Tensor, held_out: Tensor) -> SupportSet:
-    """Thin the known states to one a voxel, so that rare modes count as much as frequent ones."""
+    """Thin the known states, so that rare modes count as much as frequent ones: one a voxel, then
+    the MAX_POINTS that cover them best. The threshold is that of the thinned set."""
     voxels = torch.floor(known / VOXEL).to(torch.int64)
     _, inverse = torch.unique(voxels, dim=0, return_inverse=True)
     first = torch.full((int(inverse.max()) + 1,), len(known), dtype=torch.int64)
     first.scatter_reduce_(0, inverse, torch.arange(len(known)), reduce="amin")
-    points = known[first.sort().values].contiguous()
+    points = spread_out(known[first.sort().values], MAX_POINTS)
     distances = nearest_distance(points, held_out)
     return SupportSet(points, float(distances.quantile(PERCENTILE)))
+
+
+def spread_out(points: Tensor, count: int) -> Tensor:
+    """At most `count` of the points (P, O), in their order: each next one is the farthest from
+    those taken so far (Gonzalez 1985: at most twice the covering radius of the best choice)."""
+    if len(points) <= count:
+        return points.contiguous()
+    taken = torch.zeros(count, dtype=torch.int64)
+    distances = torch.full((len(points),), torch.inf)
+    for index in range(1, count):
+        offsets = points - points[taken[index - 1]]
+        torch.minimum(distances, (offsets * offsets).sum(1), out=distances)
+        taken[index] = distances.argmax()
+    return points[taken.sort().values].contiguous()
 
 
 def off_support_share(

@@ -1,7 +1,7 @@
 """Make a state folder or a database ready to run: tables, admin account, shipped policies.
 
 Everything here can be done again without harm. Reading a checkpoint needs torch, which must not
-live in a process that starts others for days, so a child process does that, once per checkpoint.
+live in a process that starts others for days, so a child process does that.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from server.store.tables import Annotator, Campaign, Checkpoint
 from worker.workbench import utc_now
 
 ADMIN = "admin"
-FIRST_CAMPAIGN = "avoid"
 
 
 @dataclass(frozen=True)
@@ -40,10 +39,16 @@ class Prepared:
     campaigns: int
 
 
-def prepare(settings: Settings, *, admin_password: str | None = None) -> Prepared:
+def prepare(
+    settings: Settings,
+    *,
+    admin_password: str | None = None,
+    first_campaign: TaskName = TaskName.AVOID,
+) -> Prepared:
     """Bring the database to head; ensure admin account, shipped checkpoints, a first campaign.
 
     `admin_password` None keeps the present password, or makes a random one for a new account.
+    Where there is no campaign yet, one on the task `first_campaign` is made, named like it.
     """
     upgrade(settings.database_url)
     database = Database(settings.database_url)
@@ -52,39 +57,40 @@ def prepare(settings: Settings, *, admin_password: str | None = None) -> Prepare
             password = ensure_admin(
                 session, utc_now(), ADMIN, admin_password, cheap=settings.argon2_cheap
             )
-        for task in shipped_tasks():
-            register_shipped(settings, database, task)
-        return Prepared(ADMIN, password, _ensure_campaign(database))
+        register_shipped(settings, database)
+        return Prepared(ADMIN, password, _ensure_campaign(database, first_campaign))
     finally:
         database.dispose()
 
 
-def register_shipped(settings: Settings, database: Database, task: TaskName) -> int:
-    """Make the shipped checkpoint of a task known to the database; returns its id."""
-    blob = shipped_checkpoint(task)
-    sha256 = hashlib.sha256(blob).hexdigest()
-    known = select(Checkpoint.id).where(Checkpoint.artifact_sha256 == sha256)
+def register_shipped(settings: Settings, database: Database) -> None:
+    """Make the shipped checkpoints known to the database; those that it has stay as they are."""
     assert settings.artifact_dir is not None
     store = ArtifactStore(settings.artifact_dir)
+    blobs = {task: shipped_checkpoint(task) for task in shipped_tasks()}
+    hashes = {task: hashlib.sha256(blob).hexdigest() for task, blob in blobs.items()}
     with database.read() as session:
-        found = session.scalars(known).first()
-    if found is not None and store.exists(sha256):
-        return found
+        known = set(session.scalars(select(Checkpoint.artifact_sha256)))
+    missing = [
+        task for task, sha256 in hashes.items() if sha256 not in known or not store.exists(sha256)
+    ]
+    if not missing:
+        return
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        facts = pool.submit(checkpoint_facts, blob).result()
-    store.put(blob)
-    with database.write() as session:
-        checkpoint = register_checkpoint(
-            session,
-            utc_now(),
-            store,
-            task=task.value,
-            name=f"{task}-pretrained-{facts['digest'][:8]}",
-            blob=blob,
-            code_version=importlib.metadata.version("rodif-studio"),
-            **facts,
-        )
-        return checkpoint.id
+        facts = list(pool.map(checkpoint_facts, [blobs[task] for task in missing]))
+    for task, found in zip(missing, facts, strict=True):
+        store.put(blobs[task])
+        with database.write() as session:
+            register_checkpoint(
+                session,
+                utc_now(),
+                store,
+                task=task.value,
+                name=f"{task}-pretrained-{found['digest'][:8]}",
+                blob=blobs[task],
+                code_version=importlib.metadata.version("rodif-studio"),
+                **found,
+            )
 
 
 def checkpoint_facts(blob: bytes) -> dict[str, Any]:
@@ -110,8 +116,8 @@ def checkpoint_facts(blob: bytes) -> dict[str, Any]:
     }
 
 
-def _ensure_campaign(database: Database) -> int:
-    """A first campaign on Avoid when there is none; returns how many there are."""
+def _ensure_campaign(database: Database, task: TaskName) -> int:
+    """A first campaign on that task when there is none; returns how many there are."""
     with database.write() as session:
         present = len(session.scalars(select(Campaign.id)).all())
         if present:
@@ -120,8 +126,8 @@ def _ensure_campaign(database: Database) -> int:
         create_campaign(
             session,
             utc_now(),
-            name=FIRST_CAMPAIGN,
-            task=TaskName.AVOID,
+            name=task.value,
+            task=task,
             criterion=None,
             start_checkpoint_id=None,
             settings=CampaignSettings().model_dump(mode="json"),

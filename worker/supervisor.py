@@ -27,6 +27,7 @@ from typing import IO
 from sqlalchemy import delete, update
 
 from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.spec import TaskName
 from server.settings import Settings
 from server.states import JobState
 from server.store.session import Database
@@ -237,6 +238,7 @@ def running_system(
     *,
     workers: int = 2,
     admin_password: str | None = None,
+    first_campaign: TaskName = TaskName.AVOID,
     ready_seconds: float = 90.0,
 ) -> Iterator[System]:
     """Prepare the state folder, start everything, yield when all parts are ready, stop it all.
@@ -251,7 +253,8 @@ def running_system(
     (settings.state_dir / "logs").mkdir(parents=True, exist_ok=True)
     with _own_state(settings.state_dir):
         settings = settings.model_copy(update={"port": _free_port(settings)})
-        system = System(settings, prepare(settings, admin_password=admin_password))
+        prepared = prepare(settings, admin_password=admin_password, first_campaign=first_campaign)
+        system = System(settings, prepared)
         try:
             if socket_path(settings) is not None:
                 take_over(settings, utc_now())

@@ -11,6 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from rodif_core import shipped
+from worker.cli.main import main
+
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 SIZES = {
@@ -55,6 +58,15 @@ def test_headless_demo_writes_the_table_and_leaves_nothing_running(tmp_path: Pat
     assert done.returncode == (0 if shown else 1), told
     left = [p for p in psutil.process_iter(["cmdline"]) if str(state) in str(p.info["cmdline"])]
     assert left == []
+
+
+def test_demo_of_a_task_without_policy_says_how_to_make_one(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setattr(shipped, "_file", lambda _task: tmp_path / "none.safetensors")
+    assert main(["demo", "pushing", "--state", str(tmp_path / "state")]) == 1
+    said = capsys.readouterr().err
+    assert "no checkpoint is shipped for task 'pushing'" in said
+    assert "rodif pretrain pushing" in said
+    assert not (tmp_path / "state").exists()
 
 
 def test_demo_refuses_a_folder_in_use(tmp_path: Path):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
-from worker.cli.demo import DemoConfig, DemoResult
+from worker.cli.loop import DemoConfig, DemoResult
 from worker.cli.main import main
 
 

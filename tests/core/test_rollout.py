@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from rodif_core.diffusion.chain import chain_means
-from rodif_core.drift import fit_support, nearest_distance, off_support_share, visited_states
+from rodif_core.drift import (
+    MAX_POINTS,
+    fit_support,
+    nearest_distance,
+    off_support_share,
+    spread_out,
+    visited_states,
+)
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.evaluate import evaluate, thin_path
 from rodif_core.gate import judge
@@ -113,6 +120,22 @@ def test_support_keeps_rare_places_and_takes_the_99th_percentile() -> None:
     assert len(support.points) == 2
     assert support.threshold == pytest.approx(0.099, abs=1e-6)
     assert float(nearest_distance(support.points, rare)[0]) == 0.0
+
+
+def test_spreading_out_keeps_the_far_points_and_their_order() -> None:
+    crowd = torch.tensor([[i / 100, 0.0] for i in range(10)])
+    rare = torch.tensor([[5.0, 0.0], [0.0, 7.0]])
+    points = torch.cat([crowd, rare])
+    # By hand: the first point, then the farthest one from all taken: (0, 7), (5, 0), (0.09, 0).
+    assert spread_out(points, 4).tolist() == points[[0, 9, 10, 11]].tolist()
+    assert spread_out(points, 12).tolist() == points.tolist()
+
+
+def test_support_in_many_dimensions_stays_small() -> None:
+    generator = torch.Generator().manual_seed(0)
+    known = torch.rand(MAX_POINTS + 500, 12, generator=generator)
+    support = fit_support(known, torch.rand(100, 12, generator=generator))
+    assert len(support.points) == MAX_POINTS
 
 
 def test_off_support_share_is_zero_on_the_support_and_rises_away_from_it(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -28,12 +29,18 @@ def _settings(folder: Path) -> Settings:
     return Settings(_env_file=None, state_dir=folder, argon2_cheap=True)
 
 
+def _ship(patch: pytest.MonkeyPatch, blob: bytes) -> None:
+    """Let one small policy, for Avoid, be all that the package ships."""
+    patch.setattr(preparing, "shipped_tasks", lambda: [TaskName.AVOID])
+    patch.setattr(preparing, "shipped_checkpoint", lambda _task: blob)
+
+
 @pytest.fixture(scope="module")
 def first_time(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Prepared]:
     """A folder prepared once; a tiny policy stands for the shipped one."""
     folder = tmp_path_factory.mktemp("first")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preparing, "shipped_checkpoint", lambda _task: TINY)
+        _ship(patch, TINY)
         return folder, prepare(_settings(folder))
 
 
@@ -42,7 +49,7 @@ def settings(
     first_time: tuple[Path, Prepared], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Settings:
     """A copy of the prepared folder."""
-    monkeypatch.setattr(preparing, "shipped_checkpoint", lambda _task: TINY)
+    _ship(monkeypatch, TINY)
     shutil.copytree(first_time[0], tmp_path / "state")
     return _settings(tmp_path / "state")
 
@@ -74,6 +81,27 @@ def test_empty_folder_gets_admin_checkpoint_and_a_campaign_that_can_start(
     assert (settings.artifact_dir / "sha256").is_dir()
 
 
+def test_first_campaign_is_on_the_task_asked_for(
+    settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pushing = save_checkpoint(replace(tiny_checkpoint(), task=TaskName.PUSHING))
+    monkeypatch.setattr(preparing, "shipped_tasks", lambda: [TaskName.AVOID, TaskName.PUSHING])
+    monkeypatch.setattr(
+        preparing,
+        "shipped_checkpoint",
+        lambda task: pushing if task == TaskName.PUSHING else TINY,
+    )
+    other = _settings(tmp_path / "other")
+    prepare(other, first_campaign=TaskName.PUSHING)
+    _, checkpoints, (campaign,) = _rows(other)
+    assert [one.task for one in checkpoints] == ["avoid", "pushing"]
+    assert (campaign.name, campaign.task) == ("pushing", "pushing")
+    assert campaign.published_checkpoint_id == checkpoints[1].id
+    # Where there is a campaign already, none is added.
+    prepare(settings, first_campaign=TaskName.PUSHING)
+    assert [one.task for one in _rows(settings)[2]] == ["avoid"]
+
+
 def test_second_time_changes_nothing_and_shows_no_password(settings: Settings) -> None:
     before = _rows(settings)
     assert prepare(settings).password is None
@@ -89,7 +117,7 @@ def test_newer_shipped_checkpoint_is_added_beside_the_old_one(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     newer = save_checkpoint(tiny_checkpoint(seed=1))
-    monkeypatch.setattr(preparing, "shipped_checkpoint", lambda _task: newer)
+    _ship(monkeypatch, newer)
     prepare(settings)
     _, checkpoints, (campaign,) = _rows(settings)
     assert len(checkpoints) == 2
@@ -100,7 +128,7 @@ def test_damaged_shipped_checkpoint_is_refused(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     damaged = save_checkpoint(tiny_checkpoint())[:-40]
-    monkeypatch.setattr(preparing, "shipped_checkpoint", lambda _task: damaged)
+    _ship(monkeypatch, damaged)
     with pytest.raises(CheckpointFileError, match="not a readable checkpoint"):
         prepare(settings)
 
