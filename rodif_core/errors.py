@@ -5,7 +5,9 @@
     ├── ValueOutOfRangeError    a number or text outside its legal range
     ├── TrajectoryFileError     an episode file that is missing, truncated or inconsistent
     ├── CheckpointFileError     a checkpoint file that is missing, truncated or inconsistent
+    ├── DemonstrationFileError  a file of foreign demonstrations that cannot be read
     ├── SimulationDivergedError the physics of one simulation blew up
+    ├── GraphicsError           this machine cannot draw pictures off screen
     └── LearningError           fine-tuning or pretraining cannot go on (no labels …)
 
 Every message names the offending value and the legal ones.
@@ -47,6 +49,14 @@ class CheckpointFileError(RodifError):
 
 class SimulationDivergedError(RodifError):
     """The physics of at least one simulation produced non-finite values."""
+
+
+class DemonstrationFileError(RodifError):
+    """A file of foreign demonstrations that is damaged, of another task, or not plain data."""
+
+
+class GraphicsError(RodifError):
+    """Pictures cannot be drawn on this machine; the message says what to install."""
 
 
 class LearningError(RodifError):

@@ -108,8 +108,9 @@ def _rollout_batch(
                 records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i])
         step += 1
     outcomes = env.outcomes()
+    digest = checkpoint.digest  # hashes all weights
     return [
-        _finish(record, checkpoint, task, seed, context, outcome, noise_scale)
+        _finish(record, digest, task, seed, context, outcome, noise_scale)
         for record, seed, context, outcome in zip(records, seeds, contexts, outcomes, strict=True)
     ]
 
@@ -141,7 +142,7 @@ def _decide(
 
 def _finish(
     record: _Recorder,
-    checkpoint: Checkpoint,
+    digest: str,
     task: Task,
     seed: int,
     context: dict[str, Any],
@@ -161,7 +162,7 @@ def _finish(
         info={
             "task": task.name.value,
             "seed": seed,
-            "checkpoint": checkpoint.digest,
+            "checkpoint": digest,
             "mujoco_version": mujoco.__version__,
             "control_dt": task.control_dt,
             "noise_scale": noise_scale,

@@ -1,0 +1,317 @@
+"""How quickly policies are rolled out, beside what the same work costs in its plainest forms.
+
+All rates are in CPU seconds of the process that works, which do not depend on what else the machine
+does; with two processes those of the slower one count. The parts are measured on the same episodes:
+
+* batch: `rollout`, all episodes together, on one core
+* plain: one simulation in a loop, the policy called for one row at a time
+* physics: only the physics steps of those episodes, their joint positions replayed as targets
+* network: only the policy's calls of those episodes, on the histories that it saw
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
+from rodif_core.spec import RolloutConfig, TaskName
+
+if TYPE_CHECKING:
+    import numpy as np
+    from rich.table import Table
+
+    from rodif_core.policies.checkpoint import Checkpoint
+    from rodif_core.trajectory import Trajectory
+
+CORES = (1, 2)
+PLAIN_STEPS = 400  # control steps of the plain loop, which is slow
+SEED = 40_000_000  # far from the seeds of other measurements
+LEAST_SPEEDUP = 20.0  # wanted of two cores, in units of the plain loop on one
+MOST_OVERHEAD = 2.0  # wanted: batch seconds in units of physics + network seconds
+
+
+@dataclass(frozen=True)
+class Row:
+    """One task's figures; seconds are CPU seconds for all `episodes`.
+
+    policy: "shipped", or "random": the CPU preset's network with fresh weights
+    steps: control steps of all episodes together
+    batch_s: of the slowest process, by the number of processes
+    plain_steps_per_s: control steps per CPU second of the plain loop
+    """
+
+    task: str
+    policy: str
+    episodes: int
+    steps: int
+    batch_s: Mapping[int, float]
+    plain_steps_per_s: float
+    physics_s: float
+    network_s: float
+
+    def steps_per_s(self, cores: int) -> float:
+        """Control steps a second."""
+        return self.steps / self.batch_s[cores]
+
+    def episodes_per_s(self, cores: int) -> float:
+        """Episodes a second."""
+        return self.episodes / self.batch_s[cores]
+
+    def speedup(self, cores: int) -> float:
+        """Times as quick as the plain loop."""
+        return self.steps_per_s(cores) / self.plain_steps_per_s
+
+    @property
+    def overhead(self) -> float:
+        """Seconds on one core in units of those that physics and network take alone."""
+        return self.batch_s[1] / (self.physics_s + self.network_s)
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures and what follows from them, as JSON types."""
+        by_cores = {
+            name: {str(cores): round(measure(cores), 3) for cores in self.batch_s}
+            for name, measure in (
+                ("episodes_per_s", self.episodes_per_s),
+                ("steps_per_s", self.steps_per_s),
+                ("speedup", self.speedup),
+            )
+        }
+        plain = asdict(self) | {"batch_s": {str(k): v for k, v in self.batch_s.items()}}
+        return plain | by_cores | {"overhead": round(self.overhead, 3)}
+
+
+def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
+    """Measure one task; `pool` is of max(CORES) processes."""
+    from rodif_core.rollout import rollout
+    from rodif_core.tasks import get_task
+
+    if episodes < max(CORES):
+        raise ValueOutOfRangeError("episodes", episodes, f"at least {max(CORES)}")
+    checkpoint = policy_of(task)
+    config = RolloutConfig(episodes, SEED, max_parallel=episodes)
+    rollout(checkpoint, replace(config, episodes=2))  # what happens once only is not measured
+    batch_s = {1: 0.0}
+    made: list[Trajectory] = []
+
+    def all_together() -> None:
+        made.extend(rollout(checkpoint, config))
+
+    batch_s[1] = cpu_seconds(all_together)
+    for cores in CORES[1:]:
+        batch_s[cores] = _in_processes(checkpoint, config, cores, pool)
+    started = time.process_time()
+    plain_steps = plain_loop(checkpoint, PLAIN_STEPS)
+    plain_s = time.process_time() - started
+    return Row(
+        task=task.value,
+        policy="shipped" if task in shipped_tasks() else "random",
+        episodes=episodes,
+        steps=sum(len(one.actions) for one in made),
+        batch_s=batch_s,
+        plain_steps_per_s=plain_steps / plain_s,
+        physics_s=physics_seconds(get_task(task), made),
+        network_s=network_seconds(checkpoint, made),
+    )
+
+
+def cpu_seconds(work: Callable[[], object]) -> float:
+    """CPU seconds of this process that the work takes."""
+    started = time.process_time()
+    work()
+    return time.process_time() - started
+
+
+def policy_of(task: TaskName) -> Checkpoint:
+    """The task's shipped checkpoint; where there is none, its CPU preset with fresh weights."""
+    import numpy as np
+    import torch
+
+    from rodif_core.policies.checkpoint import Checkpoint, SupportSet, load_checkpoint
+    from rodif_core.policies.normaliser import Normaliser
+    from rodif_core.policies.policy import DiffusionPolicy
+    from rodif_core.pretrain import preset_for
+    from rodif_core.tasks import get_task
+
+    if task in shipped_tasks():
+        return load_checkpoint(shipped_checkpoint(task))
+    scene = get_task(task)
+    config = preset_for(task, "cpu").policy_config(scene.observation_dim, scene.action_dim)
+    limits = np.broadcast_to(np.asarray(scene.action_limit, np.float32), (scene.action_dim,))
+    middle, span = torch.zeros(scene.observation_dim), torch.ones(scene.observation_dim)
+    scales = Normaliser(middle, span, torch.zeros(scene.action_dim), torch.tensor(limits.copy()))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        policy = DiffusionPolicy.build(config, scales)
+    support = SupportSet(torch.zeros(1, scene.observation_dim), 1.0)
+    return Checkpoint(task, policy, support, {"kind": "fresh weights"})
+
+
+def _in_processes(
+    checkpoint: Checkpoint, config: RolloutConfig, cores: int, pool: ProcessPoolExecutor
+) -> float:
+    """CPU seconds of the slowest process when the episodes are shared out."""
+    from rodif_core.policies.checkpoint import save_checkpoint
+
+    blob = save_checkpoint(checkpoint)
+    share = -(-config.episodes // cores)
+    parts = [
+        replace(config, episodes=min(share, config.episodes - first), seed=config.seed + first)
+        for first in range(0, config.episodes, share)
+    ]
+    return max(pool.map(_timed_rollout, [blob] * len(parts), parts))
+
+
+def _timed_rollout(checkpoint: bytes, config: RolloutConfig) -> float:
+    import torch
+
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.rollout import rollout
+
+    torch.set_num_threads(1)
+    loaded = load_checkpoint(checkpoint)
+    rollout(loaded, replace(config, episodes=2))
+    return cpu_seconds(lambda: rollout(loaded, config))
+
+
+def plain_loop(checkpoint: Checkpoint, least_steps: int) -> int:
+    """Whole episodes in a plain loop until `least_steps` control steps are done; returns them.
+
+    What one would write first: one environment, one row of the policy at a time, nothing kept.
+    """
+    import numpy as np
+    import torch
+
+    from rodif_core.diffusion.chain import noise_entries
+    from rodif_core.tasks import get_task
+    from rodif_core.tasks.gym_env import GymEnv
+
+    policy, size = checkpoint.policy, checkpoint.policy.config
+    shape = (1, noise_entries(policy.schedule), size.predicted_steps, size.action_dim)
+    env = GymEnv(get_task(checkpoint.task))
+    generator = torch.Generator().manual_seed(SEED)
+    steps, seed = 0, SEED
+    while steps < least_steps:
+        observation, _ = env.reset(seed=seed)
+        history, ended, seed = [observation] * size.observation_steps, False, seed + 1
+        while not ended:
+            seen = torch.from_numpy(np.stack(history)[None])
+            actions, _ = policy.act(seen, torch.randn(shape, generator=generator))
+            for action in actions[0].numpy():
+                observation, _, terminated, truncated, _ = env.step(action)
+                history = [*history[1:], observation]
+                steps += 1
+                ended = terminated or truncated
+                if ended:
+                    break
+    return steps
+
+
+def physics_seconds(task: Any, episodes: Sequence[Trajectory]) -> float:
+    """CPU seconds of nothing but the physics steps of these episodes, on one thread."""
+    import mujoco
+    import mujoco.batch
+    import numpy as np
+
+    model = task.build_model("col")
+    batch = mujoco.batch.Batch(model, len(episodes), 1)
+    qpos, ctrl = batch.bind("qpos"), batch.bind("ctrl")
+    # Every servo of the arm holds a joint, so the positions reached are targets that give the same
+    # motion and contacts.
+    joints = model.jnt_qposadr[model.actuator_trnid[:, 0]]
+    physics_steps = round(task.control_dt / model.opt.timestep)
+    lengths = np.array([len(one.actions) for one in episodes])
+    batch.reset(np.arange(len(episodes)), stage=mujoco.mjtStage.mjSTAGE_NONE)
+    qpos[:] = np.stack([one.qpos[0] for one in episodes])
+    total = 0.0
+    for step in range(int(lengths.max())):
+        ids = np.flatnonzero(lengths > step)
+        ctrl[ids] = np.stack([episodes[i].qpos[step + 1][joints] for i in ids])
+        total += cpu_seconds(functools.partial(batch.step, ids, physics_steps))
+    return total
+
+
+def network_seconds(checkpoint: Checkpoint, episodes: Sequence[Trajectory]) -> float:
+    """CPU seconds of nothing but the policy's calls of these episodes, on one thread."""
+    import numpy as np
+    import torch
+
+    from rodif_core.diffusion.chain import noise_entries
+
+    policy, size = checkpoint.policy, checkpoint.policy.config
+    shape = (noise_entries(policy.schedule), size.predicted_steps, size.action_dim)
+    total = 0.0
+    for decision in range(max(len(one.histories) for one in episodes)):
+        rows = [one.histories[decision] for one in episodes if decision < len(one.histories)]
+        histories, noise = torch.from_numpy(np.stack(rows)), torch.randn(len(rows), *shape)
+        total += cpu_seconds(functools.partial(policy.act, histories, noise))
+    return total
+
+
+def rows_table(rows: Sequence[Row]) -> Table:
+    """One line a task."""
+    from rich.table import Table
+
+    table = Table(
+        title="control steps per CPU second (episodes per CPU second)", title_justify="left"
+    )
+    for heading in ("task", "policy", "n"):
+        table.add_column(heading, no_wrap=True)
+    headings = ("1 core", "2 cores", "plain loop", "× plain, 1", "× plain, 2", "× parts")
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            row.task,
+            row.policy,
+            str(row.episodes),
+            *(f"{row.steps_per_s(c):.0f} ({row.episodes_per_s(c):.1f})" for c in CORES),
+            f"{row.plain_steps_per_s:.0f}",
+            *(f"{row.speedup(c):.1f}" for c in CORES),
+            f"{row.overhead:.2f}",
+        )
+    table.caption = (
+        "2 cores: a process each; plain loop: one simulation, one row of the policy; × parts: "
+        "seconds on one core in units of raw physics + raw network\n"
+        "random: no checkpoint is shipped; the CPU preset's network with fresh weights, so its "
+        "episodes run to their ends without pushing much"
+    )
+    return table
+
+
+def parts_table(rows: Sequence[Row]) -> Table:
+    """Where the time of one core goes, in µs of CPU a control step."""
+    from rich.table import Table
+
+    table = Table(title="µs of CPU per control step", title_justify="left")
+    table.add_column("task", no_wrap=True)
+    for heading in ("whole", "raw physics", "raw network", "all else"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        parts = (row.batch_s[1], row.physics_s, row.network_s)
+        rest = parts[0] - parts[1] - parts[2]
+        table.add_row(row.task, *(f"{1e6 * part / row.steps:.0f}" for part in (*parts, rest)))
+    return table
+
+
+def shortfalls(rows: Sequence[Row]) -> list[str]:
+    """Where a task misses what is wanted, a sentence each; empty when all hold."""
+    found = []
+    for row in rows:
+        speedup = row.speedup(max(CORES))
+        if speedup < LEAST_SPEEDUP:
+            found.append(
+                f"{row.task}: {speedup:.1f} times the plain loop on {max(CORES)} cores, less than"
+                f" {LEAST_SPEEDUP:.0f}"
+            )
+        if row.overhead > MOST_OVERHEAD:
+            found.append(
+                f"{row.task}: {row.overhead:.2f} times the sum of its parts, more than"
+                f" {MOST_OVERHEAD:.0f}"
+            )
+    return found
