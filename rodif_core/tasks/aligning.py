@@ -41,9 +41,9 @@ TOP = 0.072  # m; upper edge of the walls. D3IL's reach 0.104: more to climb, ea
 MASS = 0.4  # kg; D3IL's has 1.0
 # Where the feet stand decides how much a push off the middle turns the box: with friction at a
 # distance l from the middle it turns by offset / l^2 per metre.
-FOOT = 0.03  # m, along x and y
+FOOT = 0.034  # m, along x and y
 FOOT_FRICTION = 0.3  # on the table, as D3IL's box
-ROD_FRICTION = 0.15  # ours: the rod slides along a wall to where it wants to push
+ROD_FRICTION = 0.05  # ours: the rod slides along a wall to where it wants to push
 
 START = (0.525, -0.35)  # m, as D3IL
 START_HEIGHT = 0.25  # m, as D3IL

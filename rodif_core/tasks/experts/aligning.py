@@ -57,10 +57,12 @@ OUTSIDE = Side(-HALF - ROD_RADIUS, -0.085, 0.038)
 
 TURN = 0.10  # m of way that a turn by one radian counts for, in the choice of the wall
 MOVE = 1.0  # m of way that a metre of the rod's own way to a wall counts for
-BEND_BEARING, BEND_HEADING = 1.0, 3.0  # k1 and k2 of the steering law
+BEYOND = 0.035  # m behind the goal: what the box is steered to, so that it passes straight
+NEAREST = 0.04  # m; the steering law has no bound at its goal
+BEND_BEARING, BEND_HEADING = 1.0, 2.0  # k1 and k2 of the steering law
 OFFSET_WIDTH = 0.012  # m off its wanted place at which the rod pushes at 1/e of its speed
-OFFSET_GAIN = 0.25  # of the way to its wanted place that the rod goes in one control step
-SIDE_SPEED = 0.008
+OFFSET_GAIN = 0.4  # of the way to its wanted place that the rod goes in one control step
+SIDE_SPEED = 0.0105
 FREE_SPEED = 0.0105
 PUSH_SPEED = 0.0070
 SLOW_BEFORE, SLOWEST = 0.05, 0.5  # m before the target the push slows down, to that of its speed
@@ -169,27 +171,30 @@ def _round(ahead: float, aside: float, forward: float, sideways: float) -> Point
 
 def way(heading: int, rod: Point, goal: Point, turn: float, side: Side) -> float:
     """Estimate of the way to the goal by pushing along `heading`, in metres."""
-    bearing, final = _angles(heading, goal, turn)
+    bearing, final, distance = _angles(heading, goal, turn)
     cosine, sine = _QUARTERS[heading]
     ahead, aside = _turned(*rod, cosine, -sine)
     travel = math.hypot(ahead - side.contact, max(0.0, abs(aside) - side.reach))
-    return math.hypot(*goal) + TURN * (abs(bearing) + abs(final)) + MOVE * travel
+    return distance + TURN * (abs(bearing) + abs(final)) + MOVE * travel
 
 
 def steer(heading: int, goal: Point, turn: float) -> float:
     """Curvature in 1/m of the way to the goal (Park and Kuipers 2011, eq. 14)."""
-    bearing, final = _angles(heading, goal, turn)
-    distance = max(math.hypot(*goal), 0.01)
+    bearing, final, distance = _angles(heading, goal, turn)
+    distance = max(distance, NEAREST)
     wanted = math.atan(-BEND_BEARING * final)
     bend = 1 + BEND_BEARING / (1 + (BEND_BEARING * final) ** 2)
     return -(BEND_HEADING * (bearing - wanted) + bend * math.sin(bearing)) / distance
 
 
-def _angles(heading: int, goal: Point, turn: float) -> Point:
-    """Present and final heading as seen from the line of sight to the goal, in +- pi."""
-    sight = math.atan2(goal[1], goal[0])
+def _angles(heading: int, goal: Point, turn: float) -> tuple[float, float, float]:
+    """Present and final heading as seen from the line of sight to a point that lies BEYOND the
+    goal, in +- pi, and the distance of that point."""
+    final = heading * math.pi / 2 + turn
+    x, y = goal[0] + BEYOND * math.cos(final), goal[1] + BEYOND * math.sin(final)
+    sight = math.atan2(y, x)
     now = heading * math.pi / 2 - sight
-    return _wrap(now), _wrap(now + turn)
+    return _wrap(now), _wrap(now + turn), math.hypot(x, y)
 
 
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
