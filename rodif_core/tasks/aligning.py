@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rodif_core.tasks.blocks as blocks
-from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
 from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
 from rodif_core.tasks.panda import (

@@ -304,16 +304,18 @@ def test_the_experts_field_is_finite_and_within_the_limit(
 def test_the_expert_is_equivariant_under_a_quarter_turn_of_the_scene(mode: str) -> None:
     """It reads the scene in the box's frame only."""
     expert = AligningExpert(mode)
-    ends, boxes, targets = np.array([[0.45, -0.1, 0.05]]), pose((0.5, -0.15), 0.3), pose(TARGET, 1.0)
+    ends, boxes, targets = (
+        np.array([[0.45, -0.1, 0.05]]),
+        pose((0.5, -0.15), 0.3),
+        pose(TARGET, 1.0),
+    )
     view = View(ends, ends, objects_of(boxes, targets))
     turned_ends = np.array([[0.1, 0.45, 0.05]])  # (x, y) becomes (-y, x)
     turned = objects_of(
         pose((0.15, 0.5), 0.3 + math.pi / 2), pose((-TARGET[1], TARGET[0]), 1.0 + math.pi / 2)
     )
     first = expert.act(TASK.observe(view).astype(np.float32)[0])
-    second = expert.act(
-        TASK.observe(View(turned_ends, turned_ends, turned)).astype(np.float32)[0]
-    )
+    second = expert.act(TASK.observe(View(turned_ends, turned_ends, turned)).astype(np.float32)[0])
     assert np.allclose(second, [-first[1], first[0], first[2]], atol=1e-5)
 
 
