@@ -82,6 +82,7 @@ TASK_ARCHITECTURES: dict[str, Architecture] = {
     "pushing": Architecture.UNET,
     "sorting": Architecture.TRANSFORMER,
     "aligning": Architecture.MLP,
+    "aligning-state": Architecture.MLP,
     "stacking": Architecture.TRANSFORMER,
 }
 

@@ -23,6 +23,7 @@ class TaskName(StrEnum):
     AVOID = "avoid"
     PUSHING = "pushing"
     SORTING = "sorting"
+    ALIGNING_STATE = "aligning-state"
 
 
 class Architecture(StrEnum):

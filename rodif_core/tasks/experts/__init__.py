@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rodif_core.spec import TaskName
 from rodif_core.tasks.base import Array, Context
+from rodif_core.tasks.experts.aligning import AligningExpert
 from rodif_core.tasks.experts.avoid import AvoidExpert
 from rodif_core.tasks.experts.pushing import PushingExpert
 from rodif_core.tasks.experts.sorting import SortingExpert
@@ -42,6 +43,8 @@ def draw_expert(task: TaskName, mode: str, context: Context, rng: np.random.Gene
         return AvoidExpert.draw(mode, context, rng)
     if task is TaskName.PUSHING:
         return PushingExpert(mode)
+    if task is TaskName.ALIGNING_STATE:
+        return AligningExpert(mode)
     return SortingExpert(mode)
 
 
