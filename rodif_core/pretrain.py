@@ -83,6 +83,7 @@ TASK_ARCHITECTURES: dict[str, Architecture] = {
     "sorting": Architecture.TRANSFORMER,
     "aligning": Architecture.MLP,
     "stacking": Architecture.TRANSFORMER,
+    "stacking-state": Architecture.TRANSFORMER,
 }
 
 # To, Tp and K are the paper's (appendix, architectures and training hyperparameters); Te is ours

@@ -23,6 +23,7 @@ class TaskName(StrEnum):
     AVOID = "avoid"
     PUSHING = "pushing"
     SORTING = "sorting"
+    STACKING_STATE = "stacking-state"
 
 
 class Architecture(StrEnum):
