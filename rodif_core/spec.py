@@ -24,6 +24,7 @@ class TaskName(StrEnum):
     PUSHING = "pushing"
     SORTING = "sorting"
     ALIGNING_STATE = "aligning-state"
+    STACKING_STATE = "stacking-state"
 
 
 class Architecture(StrEnum):
