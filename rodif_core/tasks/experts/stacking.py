@@ -119,6 +119,10 @@ class StackingExpert:
         joints = kinematics.joint_step(velocity, turn)
         return np.append(joints, GRIPPER_LIMIT * grip)
 
+    def to_json(self) -> dict[str, Any]:
+        """The parameters, for the record of a demonstration."""
+        return {"mode": self.mode, "tremble": self.tremble.tolist()}
+
     @property
     def _order(self) -> list[int]:
         return [NAMES.index(name) for name in self.mode.split("-")]
