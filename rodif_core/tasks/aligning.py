@@ -49,8 +49,8 @@ START = (0.525, -0.35)  # m, as D3IL
 START_HEIGHT = 0.25  # m, as D3IL
 LOW = 0.025  # m; the rod's tip may go down to here: above the box's floor
 HIGH = 0.26  # m; no higher than demonstrations go
-# As near to the base as the arm can hold the rod upright (measured: a circle of 0.295 m); a box that
-# turns beside its start needs the room that the other tasks leave out.
+# As near to the base as the arm can hold the rod upright (measured: a circle of 0.295 m); a box
+# that turns beside its start needs the room that the other tasks leave out.
 MIN_X, MIN_REACH = 0.22, 0.30  # m
 X = (0.4, 0.6)  # m; starts and targets
 BOX_Y, TARGET_Y = (-0.25, -0.10), (0.20, 0.35)  # m

@@ -19,6 +19,7 @@ from rodif_core.tasks.aligning import (
     HIGH,
     INNER,
     LOW,
+    MIN_REACH,
     NEAR,
     TOP,
     TURNED,
@@ -26,8 +27,10 @@ from rodif_core.tasks.aligning import (
     aligned,
     in_box_frame,
     read_mode,
+    within_reach,
 )
 from rodif_core.tasks.base import View
+from rodif_core.tasks.blocks import MAX_REACH
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts.aligning import (
     INSIDE,
@@ -333,3 +336,11 @@ def test_the_expert_takes_over_wherever_it_is_left(mode: str) -> None:
         observations = env.step(actions)
     outcomes = env.outcomes()
     assert sum(one["mode"] == mode for one in outcomes) >= 5
+
+
+@given(st.floats(-1, 1.5), st.floats(-1, 1), st.floats(-1, 1))
+def test_a_clamped_point_is_within_reach_and_stays_there(x: float, y: float, z: float) -> None:
+    once = within_reach(np.array([[x, y, z]]))
+    assert MIN_REACH - 1e-12 <= np.hypot(once[0, 0], once[0, 1]) <= MAX_REACH + 1e-12
+    assert LOW <= once[0, 2] <= HIGH
+    assert np.allclose(within_reach(once), once, atol=1e-12)

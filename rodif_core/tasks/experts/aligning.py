@@ -53,7 +53,8 @@ class Side:
 
 
 INSIDE = Side(INNER - ROD_RADIUS, 0.012, 0.026)
-OUTSIDE = Side(-HALF - ROD_RADIUS, -0.085, 0.038)
+BEHIND = -0.085  # m ahead; outside the rod keeps this far behind the middle of the box
+OUTSIDE = Side(-HALF - ROD_RADIUS, BEHIND, 0.038)
 
 TURN = 0.05  # m of way that a turn by one radian counts for, in the choice of the wall; squared
 MOVE = 1.5  # m of way that a metre of the rod's own way to a wall counts for
@@ -62,13 +63,18 @@ SLACK = 0.006  # m; passing the goal at this distance is as good as through its 
 NEAREST = 0.04  # m; the steering law has no bound at its goal
 BEND_BEARING, BEND_HEADING = 1.0, 2.0  # k1 and k2 of the steering law
 OFFSET_WIDTH = 0.012  # m off its wanted place at which the rod pushes at 1/e of its speed
-OFFSET_GAIN = 0.4  # of the way to its wanted place that the rod goes in one control step
-SIDE_SPEED = 0.0105
-FREE_SPEED = 0.0105
-PUSH_SPEED = 0.0070
+GAIN = 0.4  # of the way to its wanted place that the rod goes in one control step
+GAP_GAIN = 0.3  # of the gap to the wall that it closes on top of the speed of the push
+TOUCHING = 0.003  # m; a rod that is nearer to its wall goes along when the wall turns
+FREE_SPEED = 0.0105  # m per control step
+PUSH_SPEED = 0.0070  # m per control step
+BACK_ANGLE, ROUND_ANGLE = 0.75, 1.05  # rad behind the box: no way round below, in full above
 SLOW_BEFORE, SLOWEST = 0.05, 0.5  # m before the target the push slows down, to that of its speed
+OVERLAP = HALF + ROD_RADIUS - 0.004  # m; nearer to the middle the rod is not beside the box
 HOVER = TOP + 0.03  # m; the rod's tip is at this height on its way over a wall
 OVER = (0.010, 0.022)  # m from the middle of the box, seen from above: go down below, hover above
+NEAR_WALL = (0.12, 0.16)  # m from the middle: a rod that is farther need not be high yet
+DEEP = 0.03  # m below the walls' edge: deep enough to push from within
 
 
 @dataclass(frozen=True)
@@ -110,25 +116,23 @@ def inside(rod: Point, height: float, goal: Point, turn: float) -> tuple[float, 
     within = max(abs(rod[0]), abs(rod[1])) < INNER and height < TOP
     if within:
         vx, vy = push(rod, goal, turn, INSIDE)
-        deep = ramp(TOP - height, 0.0, 0.03)
+        deep = ramp(TOP - height, 0.0, DEEP)
         return deep * vx, deep * vy, _climb(LOW - height)
     wanted = LOW + (HOVER - LOW) * ramp(off, *OVER)
     # Too low to come over the wall: up first.
     share = ramp(height, TOP - 0.01, TOP + 0.01) if off > OVER[1] else 1.0
-    share = max(share, ramp(off, 0.12, 0.16))
-    speed = share * min(FREE_SPEED, 0.4 * off)
+    share = max(share, ramp(off, *NEAR_WALL))
+    speed = share * min(FREE_SPEED, GAIN * off)
     ux, uy = unit(-rod[0], -rod[1])
     return speed * ux, speed * uy, _climb(wanted - height)
 
 
 def outside(rod: Point, height: float, goal: Point, turn: float) -> tuple[float, float, float]:
     """Velocity in the box's frame: down beside the box, round it, and against a wall."""
-    over = max(abs(rod[0]), abs(rod[1])) < HALF + ROD_RADIUS - 0.004
-    if over:
+    if max(abs(rod[0]), abs(rod[1])) < OVERLAP:  # over the box or in it: get out first
         ux, uy = unit(*rod)
-        if height > TOP:
-            return FREE_SPEED * ux, FREE_SPEED * uy, _climb(HOVER - height)
-        return 0.0, 0.0, FREE_SPEED
+        speed = FREE_SPEED * ramp(height, TOP - 0.01, TOP + 0.01)
+        return speed * ux, speed * uy, _climb(HOVER - height)
     vx, vy = push(rod, goal, turn, OUTSIDE)
     deep = 1 - ramp(height, TOP - 0.02, TOP + 0.04)
     return deep * vx, deep * vy, _climb(LOW - height)
@@ -145,11 +149,11 @@ def push(rod: Point, goal: Point, turn: float, side: Side) -> Point:
     on = math.exp(-((error / OFFSET_WIDTH) ** 2))
     speed = PUSH_SPEED * max(SLOWEST, min(1.0, distance / SLOW_BEFORE))
     gap = max(0.0, side.contact - ahead)
-    forward = on * min(FREE_SPEED, speed + 0.3 * gap)
-    forward += (1 - on) * _clip(0.4 * (side.free - ahead), FREE_SPEED)
+    forward = on * min(FREE_SPEED, speed + GAP_GAIN * gap)
+    forward += (1 - on) * _clip(GAIN * (side.free - ahead), FREE_SPEED)
     # The wall turns with the box; the rod goes along.
-    carried = -wanted / FOOT_RADIUS**2 * side.contact * on * speed if gap < 0.003 else 0.0
-    sideways = _clip(OFFSET_GAIN * error, SIDE_SPEED) + carried
+    carried = -wanted / FOOT_RADIUS**2 * side.contact * on * speed if gap < TOUCHING else 0.0
+    sideways = _clip(GAIN * error, FREE_SPEED) + carried
     if side is OUTSIDE:
         forward, sideways = _round(ahead, aside, forward, sideways)
     return _turned(forward, sideways, cosine, sine)
@@ -158,10 +162,10 @@ def push(rod: Point, goal: Point, turn: float, side: Side) -> Point:
 def _round(ahead: float, aside: float, forward: float, sideways: float) -> Point:
     """Round the box to the wall behind its middle."""
     angle = math.atan2(abs(aside), -ahead)
-    off = ramp(angle, 0.75, 1.05)
+    off = ramp(angle, BACK_ANGLE, ROUND_ANGLE)
     if off == 0.0:
         return forward, sideways
-    ux, uy = unit(-0.085 - ahead, -aside)
+    ux, uy = unit(BEHIND - ahead, -aside)
     ux, uy = go_round(ux, uy, ahead, aside, 1.0, turn=1.0 if aside > 0 else -1.0)
     return (
         (1 - off) * forward + off * FREE_SPEED * ux,
@@ -222,4 +226,4 @@ def _clip(value: float, limit: float) -> float:
 
 def _climb(error: float) -> float:
     """Vertical speed that takes the rod's tip `error` metres up."""
-    return _clip(0.4 * error, FREE_SPEED)
+    return _clip(GAIN * error, FREE_SPEED)
