@@ -30,7 +30,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--processes", type=int, default=1, help="cores used (default %(default)s)")
     parser.add_argument(
-        "--video", type=Path, help="film of the first rollouts side by side (mp4, or webp for pages)"
+        "--video",
+        type=Path,
+        help="film of the first rollouts side by side (mp4, or webp for pages)",
     )
     parser.add_argument(
         "--speed", type=int, default=1, help="of the film; 2: twice real time (default %(default)s)"
