@@ -123,8 +123,7 @@ def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list
             fresh = experts[i].tremble * np.sqrt(1 - TREMBLE_MEMORY**2)
             kick = generators[i].normal(0.0, fresh, task.action_dim)
             tremble[i] = TREMBLE_MEMORY * tremble[i] + kick
-            wanted = experts[i].act(observations[-1][i]) + tremble[i]
-            action[i] = np.clip(wanted, -task.action_limit, task.action_limit)
+            action[i] = task.clip(experts[i].act(observations[-1][i]) + tremble[i])
         actions.append(action)
         observations.append(env.step(action))
         qpos.append(env.qpos)

@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rodif_core.choice import Trial, choose, improves
 from rodif_core.contrast import Progress, contrast
 from rodif_core.drift import off_support_share
 from rodif_core.errors import LearningError
-from rodif_core.gate import OFF_SUPPORT_RATIO, OFF_SUPPORT_SLACK
 from rodif_core.guidance import guide
 from rodif_core.log_ratio import (
     PairMatrix,
@@ -33,14 +33,13 @@ from rodif_core.preferences.pairs import Preference
 from rodif_core.rollout import rollout
 from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Scorer
+from rodif_core.tasks import Task, get_task
 from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 # Rollouts inside a round never share a seed with an evaluation, nor with each other by use.
 SELECTION_SEED, SEEDS_PER_ROUND, SEEDS_PER_USE = 7_000_000, 10_000, 1_000
 IMITATION = 1.0  # guidance scale that only imitates
-NOISE = 0.04  # of a rate near 1 over 100 rollouts: two standard errors
-SUCCESS_SLACK = 0.03  # a scale may lose this much success against the parent on the same seeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,26 +67,6 @@ class Scores:
             "agreement": float((network_side == path_side).mean()),
             "kept": self.kept,
             "trajectories": len(self.used),
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """One guidance scale and what its fresh rollouts show."""
-
-    scale: float
-    policy: DiffusionPolicy
-    success: float
-    off_support: float
-    predicted: float  # share of rollouts that succeed and that the labels predict to be preferred
-
-    def to_json(self) -> dict[str, float]:
-        """Plain JSON types."""
-        return {
-            "scale": self.scale,
-            "success": self.success,
-            "off_support": self.off_support,
-            "predicted_preferred": self.predicted,
         }
 
 
@@ -153,7 +132,9 @@ def score(
     )  # fmt: skip
     ratios = compute_ratios(moved.policy, transitions, config)
     network = np.asarray(mean_ratio_per_trajectory(ratios, transitions))
-    path_utility = PathUtility.fit(PathFeatures.of(trajectories), preferences)
+    path_utility = PathUtility.fit(
+        PathFeatures.of(trajectories, get_task(checkpoint.task)), preferences
+    )
     opinions = {
         Scorer.NETWORK: standardise(network),
         Scorer.GAUSSIAN_PROCESS: standardise(path_utility.utilities),
@@ -183,38 +164,6 @@ def score(
     )
 
 
-def improves(base: Trial, before: Trial, after: Trial) -> bool:
-    """Whether a self-training pass replaces what it started from.
-
-    It imitates successes and so is believed, unless its rollouts say clearly otherwise: it left
-    the data, or it is liked less by more than chance explains.
-    """
-    kept = after.predicted - after.off_support >= before.predicted - before.off_support - NOISE
-    return kept and after.off_support <= _off_support_limit(base)
-
-
-def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
-    """The scale whose rollouts the labels like best, less what leaves the data, among those that
-    keep success and support.
-
-    When none keeps both, the one that leaves the data least. Ties go to the smaller scale.
-    """
-    limit = _off_support_limit(base)
-    sound = [
-        trial
-        for trial in trials
-        if trial.success >= base.success - SUCCESS_SLACK and trial.off_support <= limit
-    ]
-    if sound:
-        return max(sound, key=lambda trial: (trial.predicted - trial.off_support, -trial.scale))
-    return min(trials, key=lambda trial: (trial.off_support - trial.success, trial.scale))
-
-
-def _off_support_limit(base: Trial) -> float:
-    # Half the gate's slack: the gate will look at other rollouts.
-    return OFF_SUPPORT_RATIO * base.off_support + OFF_SUPPORT_SLACK / 2
-
-
 def _kept_decisions(transitions: Transitions, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
     rows = torch.tensor([row for i in kept for row in transitions.steps_of(i)])
     return transitions.histories[rows], transitions.chains[rows, -1]
@@ -232,12 +181,19 @@ def _try(
     rollouts = rollout(replace(checkpoint, policy=policy), settings)
     off = off_support_share(rollouts, checkpoint.policy.normaliser, checkpoint.support)
     success = float(np.mean([trajectory.success for trajectory in rollouts]))
-    return Trial(scale, policy, success, off, len(_liked(rollouts, scores)) / len(rollouts))
+    return Trial(
+        scale,
+        policy,
+        success,
+        off,
+        len(_liked(get_task(checkpoint.task), rollouts, scores)) / len(rollouts),
+    )
 
 
-def _liked(rollouts: Sequence[Trajectory], scores: Scores) -> list[Trajectory]:
+def _liked(task: Task, rollouts: Sequence[Trajectory], scores: Scores) -> list[Trajectory]:
     """The rollouts that succeed and that the labels predict to be preferred."""
-    predicted = scores.path_utility.predict(PathFeatures.of(rollouts)) > scores.path_threshold
+    features = PathFeatures.of(rollouts, task)
+    predicted = scores.path_utility.predict(features) > scores.path_threshold
     pairs = zip(rollouts, predicted, strict=True)
     return [trajectory for trajectory, preferred in pairs if preferred and trajectory.success]
 
@@ -267,7 +223,9 @@ def _self_train(
     steady = rollout(
         replace(checkpoint, policy=chosen.policy), settings, noise_scale=guiding.self_training_noise
     )
-    liked = near_data(checkpoint, _liked(steady, scores), base.off_support)
+    liked = near_data(
+        checkpoint, _liked(get_task(checkpoint.task), steady, scores), base.off_support
+    )
     if not liked:
         return None
     lessons = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)

@@ -82,7 +82,9 @@ TASK_ARCHITECTURES: dict[str, Architecture] = {
     "pushing": Architecture.UNET,
     "sorting": Architecture.TRANSFORMER,
     "aligning": Architecture.MLP,
+    "aligning-state": Architecture.MLP,
     "stacking": Architecture.TRANSFORMER,
+    "stacking-state": Architecture.TRANSFORMER,
 }
 
 # To, Tp and K are the paper's (appendix, architectures and training hyperparameters); Te is ours

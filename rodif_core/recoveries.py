@@ -130,7 +130,7 @@ def _actions(
         if run.expert is None:
             run.expert = _likeliest_expert(task, run)
         actions[i] = run.expert.act(run.observations[-1])
-    return np.asarray(np.clip(actions, -task.action_limit, task.action_limit))
+    return task.clip(actions)
 
 
 def _decide(checkpoint: Checkpoint, runs: Sequence[_Run]) -> NDArray[np.float32]:

@@ -99,7 +99,7 @@ def _rollout_batch(
         offset = step % size.executed_steps
         if offset == 0:
             _decide(policy, records, generators, active, chunks, noise_scale)
-        actions = np.clip(chunks[:, offset], -task.action_limit, task.action_limit)
+        actions = task.clip(chunks[:, offset])
         observations = env.step(actions)
         qpos, paths, steps_done = env.qpos, env.paths, env.steps
         for i in active:

@@ -5,10 +5,12 @@ hardly better than a coin. Two models share strength between trajectories:
 
 * the network: a few full-batch RoDiF updates on a throw-away copy of the policy; a trajectory's
   utility is its mean log-ratio. Needs no features.
-* the Gaussian process: Bradley-Terry utilities with a Gaussian-process prior over the
-  end-effector path and the outcome. Also predicts the utility of paths that nobody has seen.
+* the Gaussian process: Bradley-Terry utilities with a Gaussian-process prior over the paths of
+  the end effector and the objects, and the outcome. Also predicts the utility of trajectories
+  that nobody has seen.
 
-Legend: R trajectories, M preferences, P points of a path.
+Legend: R trajectories, M preferences, B movable objects, P points of a trajectory: of the end
+effector's path and of every object's.
 """
 
 from __future__ import annotations
@@ -21,11 +23,12 @@ from numpy.typing import NDArray
 
 from rodif_core.errors import LearningError
 from rodif_core.preferences.pairs import Preference
+from rodif_core.tasks.base import Task
 from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-PATH_POINTS = 16  # P, evenly spaced along the path
+PATH_POINTS = 16  # of one path, evenly spaced along the end effector's; P = 16 (1 + B)
 PRIOR_SD = 0.5  # of the utilities within one outcome, in Bradley-Terry log-odds
 OUTCOME_VARIANCE = 0.5  # of the common utility of successes (or failures), in units of PRIOR_SD²
 SCALE_FACTOR = 2.0  # length scale of each point's kernel, in median distances of that point
@@ -42,14 +45,17 @@ class PathFeatures:
     success: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, trajectories: Sequence[Trajectory]) -> PathFeatures:
-        """End-effector paths at PATH_POINTS places, evenly spaced along their length."""
+    def of(cls, trajectories: Sequence[Trajectory], task: Task) -> PathFeatures:
+        """The end effector and the objects of `task` at PATH_POINTS moments, evenly spaced along
+        the length of the end effector's path."""
         rows = []
         for trajectory in trajectories:
             path = trajectory.paths.astype(np.float64)
             length = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
             places = np.linspace(0, length[-1], PATH_POINTS)
-            rows.append(path[np.searchsorted(length, places).clip(max=len(path) - 1)])
+            moments = np.searchsorted(length, places).clip(max=len(path) - 1)
+            objects = task.object_poses(trajectory.qpos[moments])[..., :3].astype(np.float64)
+            rows.append(np.concatenate([path[moments], *objects.transpose(1, 0, 2)]))
         return cls(np.stack(rows), np.array([trajectory.success for trajectory in trajectories]))
 
 
@@ -57,8 +63,8 @@ class PathFeatures:
 class PathUtility:
     """Posterior mode of Bradley-Terry utilities under a Gaussian-process prior.
 
-    The kernel adds up over the points of the path, so that a criterion about one stretch of it
-    is learned from few labels, and it joins successes with successes and failures with failures
+    The kernel adds up over the points, so that a criterion about one stretch of one path is
+    learned from few labels, and it joins successes with successes and failures with failures
     only: what makes a good run good says little about a failed one.
 
     scales (P,) metres; utilities (R,); weights (R,) = K⁻¹ utilities.

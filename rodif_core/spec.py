@@ -23,6 +23,8 @@ class TaskName(StrEnum):
     AVOID = "avoid"
     PUSHING = "pushing"
     SORTING = "sorting"
+    ALIGNING_STATE = "aligning-state"
+    STACKING_STATE = "stacking-state"
 
 
 class Architecture(StrEnum):

@@ -5,17 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.spec import TaskName
+from rodif_core.tasks.control import Control, RodControl
 from rodif_core.tasks.panda import ARM_JOINTS, Mesh
 
 Array = NDArray[np.float64]
 Context = Mapping[str, Any]
+ActionT = TypeVar("ActionT", np.float32, np.float64)
 
 # How an episode can end; the outcome's "reason".
 FINISHED = "finished"
@@ -30,16 +32,22 @@ REASONS = (FINISHED, COLLISION, LEFT_WORKSPACE, TIME_LIMIT, DIVERGED)
 class View:
     """What a task sees of m simulations after a control step; positions in metres.
 
-    setpoints  (m, 3)
-    ends       (m, 3) end effectors
-    objects    (m, B, 7) poses x, y, z and quaternion w, x, y, z of the B movable objects, rounded
-               to float32 as trajectories store them: what is read from a stored trajectory is what
-               was read while it ran
+    setpoints       (m, S) as the task's control takes them
+    ends            (m, 3) end effectors
+    rotations       (m, 3, 3) of the end effectors; columns are its axes
+    joints          (m, R) measured positions of the robot's joints, rad and m
+    objects         (m, B, 7) poses x, y, z and quaternion w, x, y, z of the B movable objects,
+                    rounded to float32 as trajectories store them: what is read from a stored
+                    trajectory is what was read while it ran
+    objects_before  (m, B, 7) the same one control step earlier; at the start, those of the start
     """
 
     setpoints: Array
     ends: Array
+    rotations: Array
+    joints: Array
     objects: Array
+    objects_before: Array
 
 
 class Task(ABC):
@@ -49,16 +57,19 @@ class Task(ABC):
     number of simulations, B that of the movable objects, positions are in metres in the robot's
     base frame, and an *end* is the position of the end effector.
 
-    The model of a task has the arm's joints first and then one free joint an object, in the order
+    The model of a task has the robot's joints first and then one free joint an object, in the order
     of `objects`.
     """
 
     name: ClassVar[TaskName]
     observation_dim: ClassVar[int]
     action_dim: ClassVar[int]
-    action_limit: ClassVar[float]  # m per control step and axis; larger actions are clipped
+    # Per control step, in the unit of each axis (m, rad); one number: of all axes. Larger actions
+    # are clipped.
+    action_limit: ClassVar[float | tuple[float, ...]]
     control_dt: ClassVar[float]  # s
     max_steps: ClassVar[int]  # control steps; longer episodes fail
+    robot_joints: ClassVar[int] = ARM_JOINTS  # R: the arm's, and the fingers' where there are any
     objects: ClassVar[tuple[str, ...]] = ()  # names of the movable bodies
     contact_ends: ClassVar[bool]  # whether the rod's first contact ends the episode as a failure
     modes: ClassVar[tuple[str, ...]]  # codes of all ways to succeed
@@ -75,9 +86,18 @@ class Task(ABC):
     def sample_context(self, rng: np.random.Generator) -> dict[str, Any]:
         """Draw the start of one episode, as JSON types."""
 
+    def control(self, count: int, threads: int = 1) -> Control:
+        """What turns set-points of up to `count` simulations into servo targets."""
+        return RodControl(count, threads)
+
+    def clip(self, actions: NDArray[ActionT]) -> NDArray[ActionT]:
+        """Actions (…, A) within +- action_limit, in their own precision."""
+        limit = np.asarray(self.action_limit, dtype=actions.dtype)
+        return np.clip(actions, -limit, limit)
+
     @abstractmethod
     def start_point(self, context: Context) -> Array:
-        """First set-point (3,) of an episode.
+        """First position (3,) of the end effector in an episode, which the set-point holds.
 
         Raises ValueOutOfRangeError when the context lacks a value or has one outside its range.
         """
@@ -95,7 +115,7 @@ class Task(ABC):
 
     @abstractmethod
     def move(self, setpoints: Array, actions: Array) -> Array:
-        """Next set-points (m, 3) from the last (m, 3) and clipped actions (m, A), within reach."""
+        """Next set-points (m, S) from the last (m, S) and clipped actions (m, A), within reach."""
 
     @abstractmethod
     def observe(self, view: View) -> Array:
@@ -122,7 +142,7 @@ class Task(ABC):
 
     def object_poses(self, qpos: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Object poses (…, B, 7) in physics positions (…, Q), such as a trajectory's `qpos`."""
-        poses = qpos[..., ARM_JOINTS:]
+        poses = qpos[..., self.robot_joints :]
         return poses.reshape(*poses.shape[:-1], len(self.objects), 7)
 
     @abstractmethod

@@ -69,22 +69,23 @@ def draw_start(rng: np.random.Generator, start: tuple[float, float]) -> list[flo
 
 
 def draw_cubes(
-    rng: np.random.Generator, ranges: Sequence[tuple[Range, Range]]
+    rng: np.random.Generator, ranges: Sequence[tuple[Range, Range]], apart: float = APART
 ) -> list[list[float]]:
     """Starts [x, y, yaw in rad] of cubes, uniform in their ranges of x and y and in +- MAX_YAW;
-    drawn again until none touches another (D3IL lets them overlap, and the solver throws them)."""
+    drawn again until their centres are `apart` (m) or more (D3IL lets them overlap, and the solver
+    throws them)."""
     while True:
         places = [
             [float(rng.uniform(*x)), float(rng.uniform(*y)), float(rng.uniform(-MAX_YAW, MAX_YAW))]
             for x, y in ranges
         ]
-        if _apart(places):
+        if _apart(places, apart):
             return places
 
 
-def _apart(places: Sequence[Sequence[float]]) -> bool:
+def _apart(places: Sequence[Sequence[float]], distance: float) -> bool:
     return all(
-        np.hypot(one[0] - other[0], one[1] - other[1]) >= APART
+        np.hypot(one[0] - other[0], one[1] - other[1]) >= distance
         for one, other in combinations(places, 2)
     )
 
@@ -114,7 +115,12 @@ def read_start(context: Context, height: float, start: tuple[float, float]) -> A
     return np.append(point, height)
 
 
-def read_cubes(context: Context, ranges: Mapping[str, tuple[Range, Range]], height: float) -> Array:
+def read_cubes(
+    context: Context,
+    ranges: Mapping[str, tuple[Range, Range]],
+    height: float,
+    apart: float = APART,
+) -> Array:
     """Poses (B, 7) of cubes at `height` from context[name] = [x, y, yaw], in the order of `ranges`.
 
     Raises ValueOutOfRangeError for a place outside the ranges, a yaw outside +- MAX_YAW, or cubes
@@ -124,14 +130,13 @@ def read_cubes(context: Context, ranges: Mapping[str, tuple[Range, Range]], heig
     for name, (x, y) in ranges.items():
         legal = (
             f"[x, y, yaw] with x in {list(x)} m, y in {list(y)} m "
-            f"and yaw in [-{MAX_YAW:.4f}, {MAX_YAW:.4f}] rad, {APART} m from any other cube"
+            f"and yaw in [-{MAX_YAW:.4f}, {MAX_YAW:.4f}] rad, {apart} m from any other cube"
         )
         place = read_numbers(context, name, 3, legal)
         limits = (x, y, (-MAX_YAW, MAX_YAW))
         places.append(place.tolist())
-        if any(not a <= v <= b for v, (a, b) in zip(place, limits, strict=True)) or not _apart(
-            places
-        ):
+        within = all(a <= v <= b for v, (a, b) in zip(place, limits, strict=True))
+        if not within or not _apart(places, apart):
             raise ValueOutOfRangeError(name, context[name], legal)
         half_yaw = place[2] / 2
         turned = (np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw))
@@ -184,16 +189,24 @@ def target_shape(
     }
 
 
-def cube_shape(index: int, name: str, place: tuple[float, float], colour: str) -> dict[str, Any]:
-    """A movable cube for top-down plots, drawn at `place` where no episode is shown; `index` is
-    its place in `Task.objects`."""
+def cube_shape(
+    index: int,
+    name: str,
+    place: tuple[float, float],
+    colour: str,
+    halves: tuple[float, float, float] = (HALF, HALF, HALF),
+) -> dict[str, Any]:
+    """A movable cube or cuboid of half lengths `halves` (m) for top-down plots, drawn at `place`
+    where no episode is shown; `index` is its place in `Task.objects`."""
     return {
         "type": "cube",
         "object": index,
         "name": name,
         "x": place[0],
         "y": place[1],
-        "half": HALF,
+        "half_x": halves[0],
+        "half_y": halves[1],
+        "half_z": halves[2],
         "colour": colour,
     }
 

@@ -25,10 +25,9 @@ from rodif_core.tasks.base import (
     Task,
     View,
 )
-from rodif_core.tasks.control import RodKinematics
-from rodif_core.tasks.panda import CONTACT_SENSOR, PHYSICS_STEPS, TOOL_SITE
+from rodif_core.tasks.panda import CONTACT_SENSOR, PHYSICS_DT, TOOL_SITE
 
-REST_STEPS = 10  # control steps (0.35 s) in which objects come to rest before an episode
+REST_STEPS = 10  # control steps (about 0.35 s) in which objects come to rest before an episode
 
 
 class BatchEnv:
@@ -46,15 +45,19 @@ class BatchEnv:
         self.task = task
         self.n = n
         model = task.build_model("col")
-        self._kinematics = RodKinematics(n, threads)
+        self._control = task.control(n, threads)
+        self._physics_steps = round(task.control_dt / PHYSICS_DT)
         self._batch = mujoco.batch.Batch(model, n, threads)
         self._qpos = self._batch.bind("qpos")
         self._ctrl = self._batch.bind("ctrl")
-        self._tip = self._batch.bind("site_xpos")[:, model.site(TOOL_SITE).id]
+        tool = model.site(TOOL_SITE).id
+        self._tool = self._batch.bind("site_xpos")[:, tool]
+        self._rotation = self._batch.bind("site_xmat")[:, tool]
         self._sensors = self._batch.bind("sensordata")
-        self._contact = int(model.sensor(CONTACT_SENSOR).adr[0])
-        self._setpoints = np.zeros((n, 3))
+        self._contact = int(model.sensor(CONTACT_SENSOR).adr[0]) if task.contact_ends else None
+        self._setpoints = np.zeros((n, 0))
         self._ends = np.zeros((n, 3))
+        self._rotations = np.zeros((n, 3, 3))
         self._positions = np.zeros((n, model.nq))
         # float32, as trajectories store it: modes can be read again from what was stored.
         self._path_history = np.zeros((task.max_steps + 1, n, 3), dtype=np.float32)
@@ -78,10 +81,10 @@ class BatchEnv:
         starts = np.stack([self.task.start_point(context) for context in contexts])
         objects = np.stack([self.task.start_objects(context) for context in contexts])
         ids = np.arange(count)
-        joints = self._kinematics.start(starts)
+        setpoints, targets = self._control.start(starts)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self._qpos[ids] = np.concatenate([joints, objects.reshape(count, -1)], axis=1)
-        self._ctrl[ids] = joints
+        self._qpos[ids] = np.concatenate([targets, objects.reshape(count, -1)], axis=1)
+        self._ctrl[ids] = targets
         self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
         self._episodes = count
         self._steps = np.zeros(count, dtype=np.int64)
@@ -91,8 +94,9 @@ class BatchEnv:
             for _ in range(REST_STEPS):
                 _, failed = self._physics(ids)
                 self._end(ids[failed], DIVERGED)
-        self._setpoints = starts
-        self._ends = self._tip[ids]
+        self._setpoints = setpoints
+        self._ends = self._tool[ids]
+        self._rotations = self._rotation[ids].reshape(count, 3, 3)
         self._positions = self._qpos[ids]
         self._remember(ids)
         return self._observations()
@@ -100,7 +104,7 @@ class BatchEnv:
     def step(
         self, actions: NDArray[np.floating[Any]], active: NDArray[np.bool_] | None = None
     ) -> NDArray[np.float32]:
-        """One control step (35 ms) with actions (m, A), clipped to +- action_limit.
+        """One control step with actions (m, A), clipped to the task's limits.
 
         active  (m,) bool: which simulations move; the others, and finished ones, stay as they are.
 
@@ -121,24 +125,24 @@ class BatchEnv:
 
     def _advance(self, ids: NDArray[np.int64], actions: NDArray[np.float64]) -> None:
         """Move the simulations `ids` by one control step and see whether they end."""
-        limit = self.task.action_limit
-        setpoints = self.task.move(self._setpoints[ids], np.clip(actions, -limit, limit))
-        self._ctrl[ids] = self._kinematics.solve(setpoints, self._ctrl[ids])
+        setpoints = self.task.move(self._setpoints[ids], self.task.clip(actions))
+        self._ctrl[ids] = self._control.targets(setpoints, self._ctrl[ids])
         touched, failed = self._physics(ids)
-        ends, positions = self._tip[ids], self._qpos[ids]
+        ends, positions = self._tool[ids], self._qpos[ids]
+        rotations = self._rotation[ids].reshape(len(ids), 3, 3)
         failed |= ~np.isfinite(ends).all(axis=1) | ~np.isfinite(positions).all(axis=1)
         self._end(ids[failed], DIVERGED)
         good = ~failed
         ids, touched = ids[good], touched[good]
         self._setpoints[ids] = setpoints[good]
         self._ends[ids] = ends[good]
+        self._rotations[ids] = rotations[good]
         self._positions[ids] = positions[good]
         self._steps[ids] += 1
         self._remember(ids)
         view = self._view(ids)
         # The first reason that holds counts: contact comes before everything else.
-        if self.task.contact_ends:
-            self._end(ids[touched], COLLISION)
+        self._end(ids[touched], COLLISION)
         self._end(ids[self.task.finished(view)], FINISHED)
         self._end(ids[~self.task.inside(view)], LEFT_WORKSPACE)
         self._end(ids[self._steps[ids] >= self.task.max_steps], TIME_LIMIT)
@@ -146,20 +150,22 @@ class BatchEnv:
     def _physics(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """All physics steps of one control step; returns (touched, failed) of each simulation.
 
-        A step's sensors describe the state before it, hence the look at the last state; that of
+        Where the task does not care, nothing has touched. A step's sensors describe the state before it, hence the look at the last state; that of
         the state before the first step is the previous control step's last.
         """
         self._batch.warning[ids] = 0
-        record = np.zeros((len(ids), PHYSICS_STEPS, self._sensors.shape[1]))
+        record = np.zeros((len(ids), self._physics_steps, self._sensors.shape[1]))
         failed = np.zeros(len(ids), dtype=bool)
         try:
             out = {"sensordata": record}
-            self._batch.rollout(PHYSICS_STEPS, record=("sensordata",), ids=ids, out=out)
+            self._batch.rollout(self._physics_steps, record=("sensordata",), ids=ids, out=out)
         except mujoco.batch.SimulationError as error:
             failed |= np.isin(ids, error.ids)
         failed |= self._batch.warning[ids].reshape(len(ids), -1).any(axis=1)
         if not failed.all():
             self._batch.forward(ids[~failed], stage=mujoco.mjtStage.mjSTAGE_POS)
+        if self._contact is None:
+            return np.zeros(len(ids), dtype=bool), failed
         touched = (record[:, :, self._contact] > 0).any(axis=1)
         touched |= self._sensors[ids, self._contact] > 0
         return touched, failed
@@ -176,8 +182,15 @@ class BatchEnv:
         self._object_history[self._steps[ids], ids] = self.task.object_poses(self._positions[ids])
 
     def _view(self, ids: NDArray[np.int64]) -> View:
-        objects = self._object_history[self._steps[ids], ids].astype(np.float64)
-        return View(self._setpoints[ids], self._ends[ids], objects)
+        steps = self._steps[ids]
+        return View(
+            setpoints=self._setpoints[ids],
+            ends=self._ends[ids],
+            rotations=self._rotations[ids],
+            joints=self._positions[ids, : self.task.robot_joints],
+            objects=self._object_history[steps, ids].astype(np.float64),
+            objects_before=self._object_history[np.maximum(steps - 1, 0), ids].astype(np.float64),
+        )
 
     def _observations(self) -> NDArray[np.float32]:
         return self.task.observe(self._view(np.arange(self._episodes))).astype(np.float32)

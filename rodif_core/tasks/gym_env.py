@@ -29,8 +29,8 @@ class GymEnv(gymnasium.Env[Observation, Action]):
         self._task = task
         self._env = BatchEnv(task, 1)
         self.render_mode = None
-        limit = task.action_limit
-        self.action_space = gymnasium.spaces.Box(-limit, limit, (task.action_dim,), np.float32)
+        limits = task.clip(np.full(task.action_dim, np.inf, dtype=np.float32))
+        self.action_space = gymnasium.spaces.Box(-limits, limits, dtype=np.float32)
         self.observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (task.observation_dim,), np.float32
         )
@@ -46,7 +46,7 @@ class GymEnv(gymnasium.Env[Observation, Action]):
         return self._env.reset([context])[0], {"context": context}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One control step of 35 ms."""
+        """One control step."""
         observation = self._env.step(np.asarray(action)[None])[0]
         if not self._env.done[0]:
             return observation, 0.0, False, False, {}

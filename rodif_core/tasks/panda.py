@@ -1,4 +1,4 @@
-"""The Franka Panda arm with a rod, on a table: the scene that every task builds on.
+"""The Franka Panda arm on a table, with a rod or with its gripper: what every task builds on.
 
 The arm's description and meshes are the files of the installed gymnasium-robotics package (Farama
 Foundation, MIT; the robot files are marked Apache-2.0 there). They are only read: the package is
@@ -9,8 +9,9 @@ to 0.36 m/s.
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 
@@ -26,13 +27,28 @@ CONTROL_DT = PHYSICS_DT * PHYSICS_STEPS  # 35 ms = 28.57 Hz, as D3IL
 HOME_QPOS = (0.0, 0.223, 0.0, -2.401, 0.0, 1.054, 0.0)
 
 ARM_JOINTS = 7
+# rad; what the files allow, less 0.01 so that servos do not press against the stops.
+JOINT_LOW = (-2.887, -1.752, -2.887, -3.061, -2.887, -1.647, -2.887)
+JOINT_HIGH = (2.887, 1.752, 2.887, -0.410, 2.887, 2.102, 2.887)
 TOOL_BODY = "panda0_link7"
-TOOL_SITE = "rod_tip"  # the end effector of every task with a rod
+TOOL_SITE = "tool"  # the end effector: the tip of the rod, the middle between the finger pads
 ROD_GEOM = "rod"
 TABLE_GEOM = "table"
 CONTACT_SENSOR = "rod_contact"
 ROD_RADIUS = 0.01  # m, as D3IL
 ROD_TIP = 0.30  # m from the tool body along its axis
+
+# The same for the gripper, straight down at (0.5, 0, 0.12) m.
+GRIPPER_HOME_QPOS = (0.0, 0.144, 0.0, -2.397, 0.0, 0.972, 0.0)
+MAX_OPENING = 0.08  # m between the pads
+FINGER_JOINTS = 2
+FINGERS = ("panda0_leftfinger", "panda0_rightfinger")
+PAD_HALF = (0.010, 0.0075, 0.014)  # m, half lengths of the box that stands for a finger's pad
+PAD_HEIGHT = 0.078  # m from the finger's frame to the middle of its pad
+TOOL_FRAME = 0.1654  # m from the tool body to the fingers' frames
+# The hand is mounted turned by 45 degrees; this quaternion turns the tool's frame with it, so that
+# the fingers close along its y.
+HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)
 
 TOOL_BIT = 2  # contact bits: rod and table carry 2, objects carry 1 and meet both
 OBJECT_BIT = 1
@@ -40,6 +56,10 @@ OBJECT_BIT = 1
 _STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)  # N m / rad
 _DAMPING = (225.0, 225.0, 175.0, 175.0, 100.0, 100.0, 100.0)  # N m s / rad
 _MAX_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # N m, the real arm's limits
+_FINGER_STIFFNESS = 1000.0  # N / m
+_FINGER_DAMPING = 50.0  # N s / m
+_FINGER_MAX_FORCE = 40.0  # N
+_PAD_FRICTION = (1.0, 0.02, 0.0005)  # sliding; m of torsion and of rolling
 
 
 def panda_files() -> Path:
@@ -65,6 +85,39 @@ def rod_scene(mesh: Mesh = "col", *, rod_radius: float = ROD_RADIUS) -> mujoco.M
                 faces). The physics are the same.
     rod_radius  m; the rod's length is the same for all
     """
+    spec = _arm_scene(mesh)
+    for name in FINGERS:
+        spec.delete(spec.body(name))
+    _delete_meshes(spec, lambda name: name.startswith("finger"))
+    _add_rod(spec, rod_radius)
+    return spec
+
+
+def gripper_scene(mesh: Mesh = "col") -> mujoco.MjSpec:
+    """A table and the Panda with its gripper, ready for a task to add its objects.
+
+    The fingers' joints follow the arm's; each finger's servo takes half of the opening. `mesh` is
+    that of `rod_scene`; the fingers' drawing is the same for both.
+    """
+    spec = _arm_scene(mesh)
+    for side, name in zip((1.0, -1.0), FINGERS, strict=True):
+        for geom in list(spec.body(name).geoms):
+            if geom.type != mujoco.mjtGeom.mjGEOM_MESH:
+                spec.delete(geom)
+        _add_pad(spec.body(name), side)
+    _add_finger_servos(spec)
+    spec.body(TOOL_BODY).add_site(
+        name=TOOL_SITE,
+        pos=[0.0, 0.0, TOOL_FRAME + PAD_HEIGHT],
+        quat=HAND_QUAT,
+        size=[0.004, 0.0, 0.0],
+        group=4,
+    )
+    return spec
+
+
+def _arm_scene(mesh: Mesh) -> mujoco.MjSpec:
+    """Table, arm and hand with its fingers; no tool yet."""
     folder = panda_files()
     # The meshdir must follow the include, which sets a relative one.
     spec = mujoco.MjSpec.from_string(
@@ -77,7 +130,6 @@ def rod_scene(mesh: Mesh = "col", *, rod_radius: float = ROD_RADIUS) -> mujoco.M
     spec.compiler.degree = False
     _set_options(spec)
     _prepare_arm(spec, mesh)
-    _add_rod(spec, rod_radius)
     _add_servos(spec)
     _add_table(spec)
     return spec
@@ -86,14 +138,28 @@ def rod_scene(mesh: Mesh = "col", *, rod_radius: float = ROD_RADIUS) -> mujoco.M
 def add_cube(
     spec: mujoco.MjSpec, name: str, *, half: float, mass: float, friction: float, rgba: list[float]
 ) -> None:
-    """A free cube of half edge `half` (m) and `mass` (kg) that the rod, the table and other objects
-    touch; where it starts is the context's business."""
-    body = spec.worldbody.add_body(name=name, pos=[0.5, 0.0, half])
+    """A free cube of half edge `half` (m): see `add_block`."""
+    sizes = (half, half, half)
+    add_block(spec, name, halves=sizes, mass=mass, friction=friction, rgba=rgba)
+
+
+def add_block(
+    spec: mujoco.MjSpec,
+    name: str,
+    *,
+    halves: tuple[float, float, float],
+    mass: float,
+    friction: float,
+    rgba: list[float],
+) -> None:
+    """A free block of half lengths `halves` (m) and `mass` (kg) that the robot's tool, the table
+    and other objects touch; where it starts is the context's business."""
+    body = spec.worldbody.add_body(name=name, pos=[0.5, 0.0, halves[2]])
     body.add_freejoint(name=f"{name}_joint")
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[half, half, half],
+        size=list(halves),
         mass=mass,
         rgba=rgba,
         friction=[friction, 0.005, 0.0001],  # sliding; m of torsion and of rolling
@@ -115,16 +181,11 @@ def _set_options(spec: mujoco.MjSpec) -> None:
 
 
 def _prepare_arm(spec: mujoco.MjSpec, mesh: Mesh) -> None:
-    """Drop the fingers, keep the wanted meshes, balance gravity, let arm geoms touch nothing."""
-    for name in ("panda0_leftfinger", "panda0_rightfinger"):
-        spec.delete(spec.body(name))
+    """Keep the wanted meshes, balance gravity, let arm geoms touch nothing."""
     spec.delete(spec.site("end_effector"))
-    for asset in list(spec.meshes):
-        if asset.name.startswith("finger") or (mesh == "col" and asset.name.endswith("_viz")):
-            for geom in list(spec.geoms):
-                if geom.meshname == asset.name:
-                    spec.delete(geom)
-            spec.delete(asset)
+    # The fingers have one mesh for both kinds, and it is called _viz.
+    if mesh == "col":
+        _delete_meshes(spec, lambda name: name.endswith("_viz") and not name.startswith("finger"))
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
         if mesh == "col":
@@ -135,6 +196,56 @@ def _prepare_arm(spec: mujoco.MjSpec, mesh: Mesh) -> None:
     for joint in spec.joints:
         joint.damping = [1.0, 0.0, 0.0]  # linear, quadratic, cubic term
         joint.armature = 0.1
+
+
+def _delete_meshes(spec: mujoco.MjSpec, unwanted: Callable[[str], bool]) -> None:
+    """Delete the meshes with such names, and what is drawn with them."""
+    for asset in [asset for asset in spec.meshes if unwanted(asset.name)]:
+        for geom in list(spec.geoms):
+            if geom.meshname == asset.name:
+                spec.delete(geom)
+        spec.delete(asset)
+
+
+def _add_pad(finger: Any, side: float) -> None:
+    """One box for the 13 shapes that touch, so that a grasp has one flat, known surface.
+
+    side  1 for the finger that opens along the tool's +y, -1 for the other
+    """
+    finger.add_geom(
+        name=f"{finger.name}_pad",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0.0, side * PAD_HALF[1], PAD_HEIGHT],
+        size=list(PAD_HALF),
+        mass=0.0,
+        rgba=[0.16, 0.18, 0.22, 1.0],
+        friction=list(_PAD_FRICTION),
+        condim=6,
+        solref=[0.01, 1.0],
+        priority=1,  # else the block's friction and solver values are mixed in
+        contype=TOOL_BIT,
+        conaffinity=OBJECT_BIT,
+    )
+
+
+def _add_finger_servos(spec: mujoco.MjSpec) -> None:
+    joints = [f"robot:panda0_finger_joint{index}" for index in (1, 2)]
+    # The real gripper has one motor: both fingers are always equally far out.
+    spec.add_equality(
+        name="fingers",
+        type=mujoco.mjtEq.mjEQ_JOINT,
+        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+        name1=joints[0],
+        name2=joints[1],
+        data=[0.0, 1.0] + [0.0] * 10,
+    )
+    for index, joint in enumerate(joints, start=1):
+        servo = spec.add_actuator(
+            name=f"finger_servo{index}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
+        servo.set_to_position(kp=_FINGER_STIFFNESS, kv=_FINGER_DAMPING)
+        servo.forcelimited = True
+        servo.forcerange = [-_FINGER_MAX_FORCE, _FINGER_MAX_FORCE]
 
 
 def _add_rod(spec: mujoco.MjSpec, radius: float) -> None:

@@ -9,19 +9,22 @@ import numpy as np
 import pytest
 import torch
 
+from rodif_core.choice import Trial, choose, improves
 from rodif_core.contrast import contrast
 from rodif_core.diffusion.chain import add_noise
 from rodif_core.drift import SupportSet
 from rodif_core.errors import LearningError
 from rodif_core.finetune import finetune
 from rodif_core.guidance import guidance_target, guide
-from rodif_core.guided import Trial, choose, improves, near_data
+from rodif_core.guided import near_data
 from rodif_core.log_ratio import PairMatrix, Transitions
 from rodif_core.preferences.pairs import Preference
 from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, GuideConfig
+from rodif_core.tasks import get_task
 from tests.core.learning import chain_trajectory, tiny_checkpoint, tiny_policy
 
+AVOID = get_task("avoid")
 RODIF = FinetuneConfig(
     method=FinetuneMethod.RODIF, conservativeness=0.3, updates=6, learning_rate=1e-3, chunk_rows=64
 )
@@ -164,15 +167,31 @@ def test_path_utility_recovers_the_side_from_sparse_noisy_labels() -> None:
         if rng.random() < 0.3:
             winner, loser = loser, winner
         preferences.append(Preference(winner, loser))
-    utilities = PathUtility.fit(PathFeatures.of(trajectories), preferences).utilities
+    utilities = PathUtility.fit(PathFeatures.of(trajectories, AVOID), preferences).utilities
     above = utilities > split_threshold(utilities)
     assert (above == np.array([x < 0.5 for x in sides])).mean() > 0.9
 
 
 def test_path_features_are_evenly_spaced_along_the_path() -> None:
-    points = PathFeatures.of([chain_trajectory(tiny_policy(), 9, seed=0, x=0.4)]).points[0]
+    points = PathFeatures.of([chain_trajectory(tiny_policy(), 9, seed=0, x=0.4)], AVOID).points[0]
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert steps.max() < 1.6 * steps.min()
+
+
+def test_path_features_also_follow_every_object() -> None:
+    task = get_task("pushing")
+    one = chain_trajectory(tiny_policy(), 9, seed=0, x=0.4)
+    # The red cube moves 1 cm a step along x from 0.4 m, the green one stays; heights are 3 cm.
+    steps = np.arange(len(one.paths))
+    qpos = np.zeros((len(steps), 7 + 14), dtype=np.float32)
+    qpos[:, 7], qpos[:, 9] = 0.4 + 0.01 * steps, 0.03
+    qpos[:, 14:17] = (0.6, -0.1, 0.03)
+    (points,) = PathFeatures.of([replace(one, qpos=qpos)], task).points
+    assert points.shape == (3 * 16, 3)
+    assert points[:16] == pytest.approx(PathFeatures.of([one], AVOID).points[0], abs=1e-9)
+    assert points[16] == pytest.approx((0.4, 0.0, 0.03), abs=1e-6)
+    assert points[31] == pytest.approx((0.4 + 0.01 * steps[-1], 0.0, 0.03), abs=1e-6)
+    assert np.ptp(points[32:], axis=0) == pytest.approx(0.0)
 
 
 def test_split_threshold_does_not_depend_on_the_share_of_good_ones() -> None:

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from rodif_core.spec import TaskName
 from rodif_core.tasks.base import Array, Context
+from rodif_core.tasks.experts.aligning import AligningExpert
 from rodif_core.tasks.experts.avoid import AvoidExpert
 from rodif_core.tasks.experts.pushing import PushingExpert
 from rodif_core.tasks.experts.sorting import SortingExpert
+from rodif_core.tasks.experts.stacking import StackingExpert
 
 
 class Expert(Protocol):
@@ -26,8 +28,9 @@ class Expert(Protocol):
         """The mode that it drives for."""
 
     @property
-    def tremble(self) -> float:
-        """Standard deviation of the hand's noise on each axis, in m per control step."""
+    def tremble(self) -> float | Array:
+        """Standard deviation of the hand's noise in task units per control step: of every axis, or
+        (A,) axis by axis."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """The steady hand's action (A,) in task units for an observation (O,)."""
@@ -42,6 +45,10 @@ def draw_expert(task: TaskName, mode: str, context: Context, rng: np.random.Gene
         return AvoidExpert.draw(mode, context, rng)
     if task is TaskName.PUSHING:
         return PushingExpert(mode)
+    if task is TaskName.ALIGNING_STATE:
+        return AligningExpert(mode)
+    if task is TaskName.STACKING_STATE:
+        return StackingExpert(mode)
     return SortingExpert(mode)
 
 

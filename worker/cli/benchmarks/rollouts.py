@@ -23,7 +23,6 @@ from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
 
 if TYPE_CHECKING:
-    import numpy as np
     from rich.table import Table
 
     from rodif_core.policies.checkpoint import Checkpoint
