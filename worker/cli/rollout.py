@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--video",
         type=Path,
-        help="film of the first rollouts side by side (mp4, or webp for pages)",
+        help="film of the first rollouts (mp4; or webp, for pages)",
     )
     parser.add_argument(
         "--speed", type=int, default=1, help="of the film; 2: twice real time (default %(default)s)"

@@ -229,7 +229,7 @@ def physics_seconds(task: Any, episodes: Sequence[Trajectory]) -> float:
     total = 0.0
     for step in range(int(lengths.max())):
         ids = np.flatnonzero(lengths > step)
-        ctrl[ids] = np.stack([episodes[i].qpos[step + 1][joints] for i in ids])
+        ctrl[ids] = np.stack([episodes[int(i)].qpos[step + 1][joints] for i in ids])
         total += cpu_seconds(functools.partial(batch.step, ids, physics_steps))
     return total
 
