@@ -81,8 +81,10 @@ class _Panel:
         large = self._still.copy()
         draw = ImageDraw.Draw(large)
         poses = self._objects[min(end, len(self._objects)) - 1]
-        for cube in self._cubes:
-            corners = self._place.corners(poses[cube["object"]], cube["half"])
+        # From the lowest to the highest, as seen from above.
+        for cube in sorted(self._cubes, key=lambda cube: float(poses[cube["object"], 2])):
+            halves = (cube["half_x"], cube["half_y"], cube["half_z"])
+            corners = self._place.corners(poses[cube["object"]], halves)
             draw.polygon(corners, fill=cube["colour"], outline=INK, width=DETAIL)
         done = self._path[:end]
         if len(done) > 1:

@@ -33,14 +33,16 @@ class Map:
         (u, v), r = self.point(x, y), self.scale * radius
         return u - r, v - r, u + r, v + r
 
-    def corners(self, pose: NDArray[np.float64], half: float) -> list[tuple[float, float]]:
-        """Corners of the upper face of a cube with pose (7,) and half edge `half` (m)."""
+    def corners(
+        self, pose: NDArray[np.float64], halves: tuple[float, float, float]
+    ) -> list[tuple[float, float]]:
+        """Corners of the upper face of a block with pose (7,) and half lengths `halves` (m)."""
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, pose[3:])
         axes = rotation.reshape(3, 3).T
-        # Whichever face looks up now: a cube may have rolled.
+        # Whichever face looks up now: a block may have rolled.
         up = int(np.argmax(np.abs(axes[:, 2])))
-        u, v = (half * axes[i] for i in range(3) if i != up)
+        u, v = (halves[i] * axes[i] for i in range(3) if i != up)
         signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
         return [self.point(*(pose[:2] + a * u[:2] + b * v[:2])) for a, b in signs]
 

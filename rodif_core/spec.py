@@ -23,7 +23,9 @@ class TaskName(StrEnum):
     AVOID = "avoid"
     PUSHING = "pushing"
     SORTING = "sorting"
-    ALIGNING_STATE = "aligning-state"
+    ALIGNING = "aligning"  # seen through two cameras
+    STACKING = "stacking"  # the same
+    ALIGNING_STATE = "aligning-state"  # the same task, with the objects' poses as observations
     STACKING_STATE = "stacking-state"
 
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
-from rodif_core.tasks.aligning import AligningStateTask
+from rodif_core.tasks.aligning import AligningStateTask, AligningTask
 from rodif_core.tasks.avoid import AvoidTask
 from rodif_core.tasks.base import Task
 from rodif_core.tasks.pushing import PushingTask
 from rodif_core.tasks.sorting import SortingTask
-from rodif_core.tasks.stacking import StackingStateTask
+from rodif_core.tasks.stacking import StackingStateTask, StackingTask
 
 TASKS: dict[TaskName, Task] = {
     TaskName.AVOID: AvoidTask(),
     TaskName.PUSHING: PushingTask(),
     TaskName.SORTING: SortingTask(),
+    TaskName.ALIGNING: AligningTask(),
+    TaskName.STACKING: StackingTask(),
     TaskName.ALIGNING_STATE: AligningStateTask(),
     TaskName.STACKING_STATE: StackingStateTask(),
 }

@@ -25,6 +25,8 @@ from rodif_core.spec import TaskName
 from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
 from rodif_core.tasks.panda import (
     CONTROL_DT,
+    FRONT_CAMERA,
+    HAND_CAMERA,
     OBJECT_BIT,
     ROD_GEOM,
     ROD_RADIUS,
@@ -82,7 +84,7 @@ class AligningStateTask(Task):
     modes: ClassVar[tuple[str, ...]] = ("inside", "outside")
     groups: ClassVar[tuple[str, ...]] = modes
     preferred_group: ClassVar[str] = "inside"
-    preferred_share: ClassVar[float] = 0.7
+    preferred_share: ClassVar[float] = 0.8
     criterion: ClassVar[str] = (
         "The robot should reach into the hollow box and bring it to its target from the inside."
     )
@@ -188,6 +190,14 @@ class AligningStateTask(Task):
             },
             {"type": "start", "x": START[0], "y": START[1]},
         ]
+
+
+class AligningTask(AligningStateTask):
+    """The same, for policies that see pictures instead of poses."""
+
+    name: ClassVar[TaskName] = TaskName.ALIGNING
+    cameras: ClassVar[tuple[str, ...]] = (FRONT_CAMERA, HAND_CAMERA)
+    proprioception_dim: ClassVar[int] = 6  # set-point and end
 
 
 def aligned(objects: Array) -> NDArray[np.bool_]:

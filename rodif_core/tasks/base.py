@@ -63,6 +63,11 @@ class Task(ABC):
 
     name: ClassVar[TaskName]
     observation_dim: ClassVar[int]
+    # Views that policies see (of the model's cameras); none: policies see the whole observation.
+    # A policy that sees pictures gets the first `proprioception_dim` numbers of it besides: what
+    # a robot knows of itself. The rest tells scripted experts and the drift measure the state.
+    cameras: ClassVar[tuple[str, ...]] = ()
+    proprioception_dim: ClassVar[int] = 0  # of a task with cameras
     action_dim: ClassVar[int]
     # Per control step, in the unit of each axis (m, rad); one number: of all axes. Larger actions
     # are clipped.

@@ -3,9 +3,10 @@
 The set-point of a rod is a point, which inverse kinematics turns into joint targets; that of the
 gripper arm is the joint targets themselves and the opening of the fingers.
 
-Inverse kinematics: damped least squares (Wampler 1986, Nakamura & Hanafusa 1986) on the six-dimensional tip error, with
-a pull of the redundant joint towards the home posture. It runs on the set-points only, never on
-measured joints, so that the joint targets do not depend on how well the servos track.
+Inverse kinematics: damped least squares (Wampler 1986, Nakamura & Hanafusa 1986) on the
+six-dimensional error of the tool, with a pull of the redundant joint towards the home posture. It
+runs on the set-points only, never on measured joints, so that the joint targets do not depend on
+how well the servos track.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ class ArmKinematics:
         self._identity = np.eye(ARM_JOINTS)
 
     def start(self, targets: Array) -> Array:
-        """Joint positions (m, 7) in rad for tool positions `targets` (m, 3) in metres, from home."""
+        """Joint positions (m, 7) in rad for tools at `targets` (m, 3) in metres, from home."""
         home = np.tile(self._home, (len(targets), 1))
         return self.solve(targets, home, START_ITERATIONS)
 

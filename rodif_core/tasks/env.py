@@ -150,8 +150,9 @@ class BatchEnv:
     def _physics(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """All physics steps of one control step; returns (touched, failed) of each simulation.
 
-        Where the task does not care, nothing has touched. A step's sensors describe the state before it, hence the look at the last state; that of
-        the state before the first step is the previous control step's last.
+        Where contact does not end episodes, nothing counts as touched. A step's sensors describe
+        the state before it, hence the look at the last one; that of the state before the first step
+        is the previous control step's last.
         """
         self._batch.warning[ids] = 0
         record = np.zeros((len(ids), self._physics_steps, self._sensors.shape[1]))

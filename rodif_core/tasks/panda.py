@@ -31,6 +31,7 @@ ARM_JOINTS = 7
 JOINT_LOW = (-2.887, -1.752, -2.887, -3.061, -2.887, -1.647, -2.887)
 JOINT_HIGH = (2.887, 1.752, 2.887, -0.410, 2.887, 2.102, 2.887)
 TOOL_BODY = "panda0_link7"
+FRONT_CAMERA, HAND_CAMERA = "front", "hand"  # D3IL's two views
 TOOL_SITE = "tool"  # the end effector: the tip of the rod, the middle between the finger pads
 ROD_GEOM = "rod"
 TABLE_GEOM = "table"
@@ -132,6 +133,13 @@ def _arm_scene(mesh: Mesh) -> mujoco.MjSpec:
     _prepare_arm(spec, mesh)
     _add_servos(spec)
     _add_table(spec)
+    # In front of the hand, tilted towards the tool's tip.
+    spec.body(TOOL_BODY).add_camera(
+        name=HAND_CAMERA,
+        pos=[0.0636, -0.0636, 0.107],
+        quat=[0.1131, 0.9169, 0.3798, 0.0468],
+        fovy=70.0,
+    )
     return spec
 
 
@@ -299,7 +307,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
         pos=[0.3, -0.4, 2.0], dir=[0.1, 0.2, -1.0], diffuse=[0.55, 0.55, 0.55], castshadow=False
     )
     spec.worldbody.add_camera(
-        name="front",
+        name=FRONT_CAMERA,
         pos=[1.05, 0.0, 1.2],
         quat=[0.683, 0.183, 0.183, 0.683],
         fovy=45.0,  # D3IL's camera

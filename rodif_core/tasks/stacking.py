@@ -27,6 +27,8 @@ from rodif_core.tasks.control import Control, GripperControl
 from rodif_core.tasks.panda import (
     ARM_JOINTS,
     FINGER_JOINTS,
+    FRONT_CAMERA,
+    HAND_CAMERA,
     JOINT_HIGH,
     JOINT_LOW,
     MAX_OPENING,
@@ -78,14 +80,16 @@ GRIPPER_LIMIT = 0.008  # m per control step: open to closed in ten
 NEAR = 0.06  # m; scale on which tanh features tell places near a goal apart
 
 
-class StackingTask(Task):
-    """Everything but what the policy sees.
+class StackingStateTask(Task):
+    """Stacking seen through the true poses of the blocks.
 
     The six modes are named by the order of the placements: "red-blue-green" is red on the pad,
     blue on it, green on top. Every mode is its own group; a failure's group is settled as soon as
     two blocks have been stacked.
     """
 
+    name: ClassVar[TaskName] = TaskName.STACKING_STATE
+    observation_dim: ClassVar[int] = 59
     action_dim: ClassVar[int] = ARM_JOINTS + 1  # changes of the joints' set-points and the opening
     action_limit: ClassVar[float | tuple[float, ...]] = (*[JOINT_LIMIT] * ARM_JOINTS, GRIPPER_LIMIT)
     control_dt: ClassVar[float] = 12 * PHYSICS_DT  # 30 ms = 33.3 Hz, as D3IL
@@ -149,6 +153,33 @@ class StackingTask(Task):
     def move(self, setpoints: Array, actions: Array) -> Array:
         return np.clip(setpoints + actions, (*JOINT_LOW, 0.0), (*JOINT_HIGH, MAX_OPENING))
 
+    def observe(self, view: View) -> Array:
+        """Proprioception (14), then of every block: x, y, z, sin and cos of its yaw times its
+        symmetry (15); its offset from the jaws and sin and cos of the turn that a grasp still
+        lacks (15); its offset from the next place of the tower (9). Then the offset of that place
+        from the jaws (3), and which blocks are in the tower (3). Offsets are tanh(metres / NEAR).
+        """
+        levels = placed_levels(view.objects, view.ends)
+        place = next_place(view.objects, levels)
+        yaws = blocks.yaws(view.objects)
+        turns = SYMMETRY * yaws
+        lacking = SYMMETRY * (yaws + GRASP_TURN - tool_yaws(view.rotations)[:, None])
+        places = view.objects[:, :, :3]
+        own = np.concatenate([places, sin_cos(turns)], axis=2)
+        seen = np.concatenate([near(places - view.ends[:, None]), sin_cos(lacking)], axis=2)
+        rows = len(view.ends)
+        return np.concatenate(
+            [
+                proprioception(view),
+                own.reshape(rows, -1),
+                seen.reshape(rows, -1),
+                near(places - place[:, None]).reshape(rows, -1),
+                near(place - view.ends),
+                (levels >= 0).astype(np.float64),
+            ],
+            axis=1,
+        )
+
     def finished(self, view: View) -> NDArray[np.bool_]:
         stacked = tower_height(placed_levels(view.objects, view.ends)) == len(NAMES)
         return np.asarray(stacked & at_rest(view.objects, view.objects_before))
@@ -189,38 +220,12 @@ class StackingTask(Task):
         ]
 
 
-class StackingStateTask(StackingTask):
-    """Stacking seen through the true poses of the blocks."""
+class StackingTask(StackingStateTask):
+    """The same, for policies that see pictures instead of poses."""
 
-    name: ClassVar[TaskName] = TaskName.STACKING_STATE
-    observation_dim: ClassVar[int] = 59
-
-    def observe(self, view: View) -> Array:
-        """Proprioception (14), then of every block: x, y, z, sin and cos of its yaw times its
-        symmetry (15); its offset from the jaws and sin and cos of the turn that a grasp still
-        lacks (15); its offset from the next place of the tower (9). Then the offset of that place
-        from the jaws (3), and which blocks are in the tower (3). Offsets are tanh(metres / NEAR).
-        """
-        levels = placed_levels(view.objects, view.ends)
-        place = next_place(view.objects, levels)
-        yaws = blocks.yaws(view.objects)
-        turns = SYMMETRY * yaws
-        lacking = SYMMETRY * (yaws + GRASP_TURN - tool_yaws(view.rotations)[:, None])
-        places = view.objects[:, :, :3]
-        own = np.concatenate([places, sin_cos(turns)], axis=2)
-        seen = np.concatenate([near(places - view.ends[:, None]), sin_cos(lacking)], axis=2)
-        rows = len(view.ends)
-        return np.concatenate(
-            [
-                proprioception(view),
-                own.reshape(rows, -1),
-                seen.reshape(rows, -1),
-                near(places - place[:, None]).reshape(rows, -1),
-                near(place - view.ends),
-                (levels >= 0).astype(np.float64),
-            ],
-            axis=1,
-        )
+    name: ClassVar[TaskName] = TaskName.STACKING
+    cameras: ClassVar[tuple[str, ...]] = (FRONT_CAMERA, HAND_CAMERA)
+    proprioception_dim: ClassVar[int] = 14
 
 
 def proprioception(view: View) -> Array:

@@ -20,7 +20,6 @@ from rodif_core.tasks import TASKS, Task, get_task
 from rodif_core.tasks.base import REASONS
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts import draw_expert
-from rodif_core.tasks.panda import ARM_JOINTS
 from rodif_core.trajectory import Trajectory
 
 TASK_PARAMS = [pytest.param(task, id=name.value) for name, task in TASKS.items()]
@@ -31,24 +30,37 @@ pytestmark = pytest.mark.parametrize("task", TASK_PARAMS)
 
 @dataclass(frozen=True)
 class Mirror:
-    """The scene's plane of symmetry x = `x` (m), and what it does to a mode."""
+    """The scene's plane of symmetry x = `x` (m), and what it does to a mode.
+
+    objects  the order in which the objects appear in the mirror: some exchange their colours
+    """
 
     x: float
     mode: Callable[[str], str]
-    swaps: bool = True  # whether the objects change places, as cubes of two colours do
+    objects: tuple[int, ...] = ()
 
 
 def mirrored_gaps(mode: str) -> str:
     return f"{'R' if mode[0] == 'L' else 'L'}-{4 - int(mode[2])}{5 - int(mode[3])}"
 
 
+def exchanged_cubes(mode: str) -> str:
+    swap = {"red": "green", "green": "red", "blue": "blue"}
+    return "-".join(swap[name] for name in mode.split("-"))
+
+
 # Where there are two cubes and two places for them, the mirror also exchanges their colours.
+# Stacking's starts have no plane of symmetry, but the tower has: the plane through the pad. There
+# the two cubes, which are alike, exchange their colours; the cuboid has no like.
 MIRRORS = {
     TaskName.AVOID: Mirror(0.5, mirrored_gaps),
-    TaskName.PUSHING: Mirror(0.525, lambda m: m.translate(str.maketrans("rg", "gr"))),
-    TaskName.SORTING: Mirror(0.5125, lambda m: "-".join(reversed(m.split("-")))),
-    TaskName.ALIGNING_STATE: Mirror(0.5, lambda m: m, swaps=False),
+    TaskName.PUSHING: Mirror(0.525, lambda m: m.translate(str.maketrans("rg", "gr")), (1, 0)),
+    TaskName.SORTING: Mirror(0.5125, lambda m: "-".join(reversed(m.split("-"))), (1, 0)),
+    TaskName.ALIGNING_STATE: Mirror(0.5, lambda m: m, (0, 1)),
+    TaskName.STACKING_STATE: Mirror(0.5, exchanged_cubes, (1, 0, 2)),
 }
+MIRRORS[TaskName.ALIGNING] = MIRRORS[TaskName.ALIGNING_STATE]
+MIRRORS[TaskName.STACKING] = MIRRORS[TaskName.STACKING_STATE]
 
 
 @cache
@@ -258,8 +270,7 @@ def test_a_mirrored_trajectory_has_the_mirrored_mode(task: Task) -> None:
         path[:, 0] = 2 * mirror.x - path[:, 0]
         objects[..., 0] = 2 * mirror.x - objects[..., 0]
         objects[..., 3:] *= (1, 1, -1, -1)  # rotations about y and z turn the other way
-        if mirror.swaps:
-            objects = objects[:, ::-1]
+        objects = objects[:, list(mirror.objects)]
         found = task.outcome(path, objects, one.outcome["reason"])
         assert found["mode"] == mirror.mode(one.outcome["mode"])
 
@@ -286,12 +297,13 @@ def test_a_context_without_its_values_is_refused(task: Task) -> None:
             BatchEnv(task, 1).reset([{k: v for k, v in whole.items() if k != name}])
 
 
-def test_the_model_has_the_arm_first_and_then_the_objects(task: Task) -> None:
+def test_the_model_has_the_robot_first_and_then_the_objects(task: Task) -> None:
     model = task.build_model()
-    assert model.nq == ARM_JOINTS + 7 * len(task.objects)
+    assert model.nq == task.robot_joints + 7 * len(task.objects)
+    assert model.nu == task.robot_joints
     for index, name in enumerate(task.objects):
         joint = model.body(name).jntadr[0]
-        assert model.jnt_qposadr[joint] == ARM_JOINTS + 7 * index
+        assert model.jnt_qposadr[joint] == task.robot_joints + 7 * index
 
 
 def test_outcomes_are_refused_before_all_episodes_have_ended(task: Task) -> None:
@@ -332,7 +344,9 @@ def test_constants_agree_with_each_other(task: Task) -> None:
     assert len(set(task.modes)) == len(task.modes)
     assert task.preferred_group in task.groups
     assert task.criterion.endswith(".")
-    assert task.action_limit > 0 and task.control_dt > 0
+    limits = task.clip(np.full(task.action_dim, np.inf))
+    assert (limits > 0).all() and np.array_equal(task.clip(-2 * limits), -limits)
+    assert task.control_dt > 0
 
 
 def test_scene_shapes_survive_json(task: Task) -> None:

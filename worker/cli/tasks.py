@@ -15,6 +15,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def facts() -> list[dict[str, Any]]:
     """One row a task, as JSON types."""
+    import numpy as np
+
     from rodif_core.shipped import shipped_tasks
     from rodif_core.tasks import TASKS
 
@@ -23,7 +25,7 @@ def facts() -> list[dict[str, Any]]:
             "task": name.value,
             "observation_dim": task.observation_dim,
             "action_dim": task.action_dim,
-            "action_limit": task.action_limit,
+            "action_limits": task.clip(np.full(task.action_dim, np.inf)).tolist(),
             "control_dt": task.control_dt,
             "max_steps": task.max_steps,
             "objects": list(task.objects),
@@ -48,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     from rich.table import Table
 
     table = Table(
-        caption="obs and act: dims; limit: mm per control step and axis; --json names the modes"
+        caption="obs and act: dims; limit: mm (of joints: mrad) per control step and axis; "
+        "--json names the modes"
     )
     for heading in ("task", "obs", "act", "limit", "steps", "modes", "preferred", "shipped"):
         table.add_column(heading, no_wrap=True)
@@ -57,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
             row["task"],
             str(row["observation_dim"]),
             str(row["action_dim"]),
-            f"{1000 * row['action_limit']:g}",
+            # 12.5 for a rod; 60, 8 for seven joints and a gripper
+            ", ".join(f"{1000 * limit:g}" for limit in dict.fromkeys(row["action_limits"])),
             str(row["max_steps"]),
             str(len(row["modes"])),
             row["preferred_group"],

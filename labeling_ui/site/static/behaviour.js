@@ -109,7 +109,7 @@ function sceneShape(shape) {
   }
   if (shape.type === "cube") { // somewhere in its start range, so only an outline
     return svg("rect", {
-      x: shape.x - shape.half, y: -shape.y - shape.half, width: 2 * shape.half, height: 2 * shape.half,
+      x: shape.x - shape.half_x, y: -shape.y - shape.half_y, width: 2 * shape.half_x, height: 2 * shape.half_y,
       fill: "none", stroke: shape.colour, "stroke-width": 0.004, "stroke-dasharray": "0.012 0.008",
     });
   }

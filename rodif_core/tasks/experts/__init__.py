@@ -45,9 +45,9 @@ def draw_expert(task: TaskName, mode: str, context: Context, rng: np.random.Gene
         return AvoidExpert.draw(mode, context, rng)
     if task is TaskName.PUSHING:
         return PushingExpert(mode)
-    if task is TaskName.ALIGNING_STATE:
+    if task in (TaskName.ALIGNING, TaskName.ALIGNING_STATE):
         return AligningExpert(mode)
-    if task is TaskName.STACKING_STATE:
+    if task in (TaskName.STACKING, TaskName.STACKING_STATE):
         return StackingExpert(mode)
     return SortingExpert(mode)
 

@@ -55,9 +55,10 @@ class Side:
 INSIDE = Side(INNER - ROD_RADIUS, 0.012, 0.026)
 OUTSIDE = Side(-HALF - ROD_RADIUS, -0.085, 0.038)
 
-TURN = 0.10  # m of way that a turn by one radian counts for, in the choice of the wall
-MOVE = 1.0  # m of way that a metre of the rod's own way to a wall counts for
+TURN = 0.05  # m of way that a turn by one radian counts for, in the choice of the wall; squared
+MOVE = 1.5  # m of way that a metre of the rod's own way to a wall counts for
 BEYOND = 0.035  # m behind the goal: what the box is steered to, so that it passes straight
+SLACK = 0.006  # m; passing the goal at this distance is as good as through its middle
 NEAREST = 0.04  # m; the steering law has no bound at its goal
 BEND_BEARING, BEND_HEADING = 1.0, 2.0  # k1 and k2 of the steering law
 OFFSET_WIDTH = 0.012  # m off its wanted place at which the rod pushes at 1/e of its speed
@@ -139,8 +140,7 @@ def push(rod: Point, goal: Point, turn: float, side: Side) -> Point:
     cosine, sine = _QUARTERS[heading]
     ahead, aside = _turned(*rod, cosine, -sine)
     distance = math.hypot(*goal)
-    curvature = steer(heading, goal, turn)
-    wanted = max(-side.reach, min(side.reach, -curvature * FOOT_RADIUS**2))
+    wanted = offset(heading, goal, turn, side)
     error = wanted - aside
     on = math.exp(-((error / OFFSET_WIDTH) ** 2))
     speed = PUSH_SPEED * max(SLOWEST, min(1.0, distance / SLOW_BEFORE))
@@ -174,8 +174,13 @@ def way(heading: int, rod: Point, goal: Point, turn: float, side: Side) -> float
     bearing, final, distance = _angles(heading, goal, turn)
     cosine, sine = _QUARTERS[heading]
     ahead, aside = _turned(*rod, cosine, -sine)
-    travel = math.hypot(ahead - side.contact, max(0.0, abs(aside) - side.reach))
-    return distance + TURN * (abs(bearing) + abs(final)) + MOVE * travel
+    travel = math.hypot(ahead - side.contact, aside - offset(heading, goal, turn, side))
+    return distance + TURN * (bearing**2 + final**2) + MOVE * travel
+
+
+def offset(heading: int, goal: Point, turn: float, side: Side) -> float:
+    """Where on the wall to push, aside of its middle."""
+    return _clip(-steer(heading, goal, turn) * FOOT_RADIUS**2, side.reach)
 
 
 def steer(heading: int, goal: Point, turn: float) -> float:
@@ -191,7 +196,10 @@ def _angles(heading: int, goal: Point, turn: float) -> tuple[float, float, float
     """Present and final heading as seen from the line of sight to a point that lies BEYOND the
     goal, in +- pi, and the distance of that point."""
     final = heading * math.pi / 2 + turn
-    x, y = goal[0] + BEYOND * math.cos(final), goal[1] + BEYOND * math.sin(final)
+    cosine, sine = math.cos(final), math.sin(final)
+    aside = cosine * goal[1] - sine * goal[0]
+    slack = _clip(aside, SLACK)
+    x, y = goal[0] + BEYOND * cosine + slack * sine, goal[1] + BEYOND * sine - slack * cosine
     sight = math.atan2(y, x)
     now = heading * math.pi / 2 - sight
     return _wrap(now), _wrap(now + turn), math.hypot(x, y)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from rodif_core.errors import UnknownNameError
 from rodif_core.tasks.base import Array
 from rodif_core.tasks.experts.jaws import jaw_kinematics
 from rodif_core.tasks.experts.push import ramp
-from rodif_core.tasks.panda import MAX_OPENING
 from rodif_core.tasks.stacking import (
     GRIPPER_LIMIT,
     LEVELS,
@@ -119,6 +118,10 @@ class StackingExpert:
             velocity, turn, grip = free * velocity, free * turn, 1.0
         joints = kinematics.joint_step(velocity, turn)
         return np.append(joints, GRIPPER_LIMIT * grip)
+
+    def to_json(self) -> dict[str, Any]:
+        """The parameters, for the record of a demonstration."""
+        return {"mode": self.mode, "tremble": self.tremble.tolist()}
 
     @property
     def _order(self) -> list[int]:
