@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rodif_core.demonstrations import recorded_episode
-from rodif_core.errors import DemonstrationFileError, UnknownNameError, ValueOutOfRangeError
+from rodif_core.errors import DemonstrationFileError, ValueOutOfRangeError
 from rodif_core.plain_pickle import StoredArray, read_plain_pickle
 from rodif_core.spec import TaskName
 from rodif_core.tasks import Task
@@ -106,14 +106,16 @@ class _Format:
     setpoints: Callable[[_Record], Array]
 
 
+_ALIGNING = _Format({"box": "push-box", "target": "target-box"}, _spatial)
+_STACKING = _Format({"red": "red-box", "green": "green-box", "blue": "blue-box"}, _joints)
 FORMATS: dict[TaskName, _Format] = {
     TaskName.AVOID: _Format({}, _planar),
     TaskName.PUSHING: _Format({"red": "red-box", "green": "green-box"}, _planar),
     TaskName.SORTING: _Format({"red": "red-box1", "blue": "blue-box1"}, _planar),
-    TaskName.ALIGNING_STATE: _Format({"box": "push-box", "target": "target-box"}, _spatial),
-    TaskName.STACKING_STATE: _Format(
-        {"red": "red-box", "green": "green-box", "blue": "blue-box"}, _joints
-    ),
+    TaskName.ALIGNING: _ALIGNING,
+    TaskName.STACKING: _STACKING,
+    TaskName.ALIGNING_STATE: _ALIGNING,
+    TaskName.STACKING_STATE: _STACKING,
 }
 
 
@@ -134,9 +136,7 @@ def episode_files(paths: Sequence[Path]) -> list[Path]:
 
 def read_episode(task: TaskName, path: Path) -> D3ilEpisode:
     """Read one file; raises DemonstrationFileError when it is damaged, holds more than plain data
-    or is of another task, and UnknownNameError for a task that D3IL has not."""
-    if task not in FORMATS:
-        raise UnknownNameError("task of D3IL", task, FORMATS)
+    or is of another task."""
     try:
         data = path.read_bytes()
     except OSError as error:

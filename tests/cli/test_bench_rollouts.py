@@ -95,7 +95,14 @@ def test_the_plain_loop_does_whole_episodes():
     assert 1 < steps <= get_task("avoid").max_steps
 
 
-@pytest.mark.parametrize("task", TaskName)
+def test_tasks_that_are_seen_through_cameras_are_not_timed(capsys: pytest.CaptureFixture[str]):
+    assert rollouts.legal_tasks(["sorting", "avoid"]) == [TaskName.AVOID, TaskName.SORTING]
+    assert not any(get_task(name).cameras for name in rollouts.legal_tasks(None))
+    assert main(["bench", "rollouts", "--tasks", "aligning"]) == 1
+    assert "unknown task without cameras 'aligning'; legal values" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", rollouts.legal_tasks(None))
 def test_every_task_has_a_policy_to_time(task: TaskName):
     checkpoint = rollouts.policy_of(task)
     assert checkpoint.task is task

@@ -171,8 +171,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     fine.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
     fine.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
     timing = parser.add_argument_group("rollouts: how quick they are")
-    tasks = [task.value for task in TaskName]
-    timing.add_argument("--tasks", nargs="+", choices=tasks, default=tasks, help="(default: all)")
+    timing.add_argument(
+        "--tasks",
+        nargs="+",
+        choices=list(TaskName),
+        metavar="TASK",
+        help="(default: all that are not seen through cameras)",
+    )
     timing.add_argument(
         "--episodes", type=int, default=128, help="of each core (default %(default)s)"
     )
@@ -181,7 +186,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Compare or time; 1 when a target is missed."""
     if args.what == "rollouts":
-        return _time_rollouts([TaskName(name) for name in args.tasks], args.episodes, args.json)
+        return _time_rollouts(args.tasks, args.episodes, args.json)
     if args.json is None:
         raise RodifError("`rodif bench avoid` needs --json FILE, which keeps its rows")
 
@@ -200,11 +205,12 @@ def run(args: argparse.Namespace) -> int:
     return 1 if missed else 0
 
 
-def _time_rollouts(tasks: Sequence[TaskName], episodes: int, file: Path | None) -> int:
+def _time_rollouts(names: Sequence[str] | None, episodes: int, file: Path | None) -> int:
     import torch
     from rich.console import Console
     from rich.progress import Progress
 
+    tasks = rollouts.legal_tasks(names)
     torch.set_num_threads(1)
     rows = []
     with (

@@ -18,7 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
 
@@ -83,6 +83,18 @@ class Row:
             )
         }
         return asdict(self) | by_cores | {"overhead": self.overhead}
+
+
+def legal_tasks(names: Sequence[str] | None) -> list[TaskName]:
+    """The named tasks, or all that can be timed; raises UnknownNameError for one that cannot."""
+    from rodif_core.tasks import TASKS
+
+    # With pictures, drawing and encoding them would be what is measured.
+    legal = [name for name, task in TASKS.items() if not task.cameras]
+    for name in names or []:
+        if name not in legal:
+            raise UnknownNameError("task without cameras", name, legal)
+    return [name for name in legal if names is None or name in names]
 
 
 def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
