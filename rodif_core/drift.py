@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rodif_core.policies.checkpoint import SupportSet
+from rodif_core.policies.checkpoint import Checkpoint, SupportSet
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.trajectory import Trajectory
 
@@ -34,16 +34,19 @@ def nearest_distance(points: Tensor, states: Tensor) -> Tensor:
     return torch.cat([torch.cdist(chunk, points).amin(1) for chunk in states.split(_CHUNK)])
 
 
-def fit_support(known: Tensor, held_out: Tensor) -> SupportSet:
+def fit_support(
+    known: Tensor, held_out: Tensor, normaliser: Normaliser | None = None
+) -> SupportSet:
     """Thin the known states, so that rare modes count as much as frequent ones: one a voxel, then
-    the MAX_POINTS that cover them best. The threshold is that of the thinned set."""
+    the MAX_POINTS that cover them best. The threshold is that of the thinned set; `normaliser`
+    is theirs where it is not the policy's."""
     voxels = torch.floor(known / VOXEL).to(torch.int64)
     _, inverse = torch.unique(voxels, dim=0, return_inverse=True)
     first = torch.full((int(inverse.max()) + 1,), len(known), dtype=torch.int64)
     first.scatter_reduce_(0, inverse, torch.arange(len(known)), reduce="amin")
     points = spread_out(known[first.sort().values], MAX_POINTS)
     distances = nearest_distance(points, held_out)
-    return SupportSet(points, float(distances.quantile(PERCENTILE)))
+    return SupportSet(points, float(distances.quantile(PERCENTILE)), normaliser)
 
 
 def spread_out(points: Tensor, count: int) -> Tensor:
@@ -60,9 +63,8 @@ def spread_out(points: Tensor, count: int) -> Tensor:
     return points[taken.sort().values].contiguous()
 
 
-def off_support_share(
-    trajectories: Sequence[Trajectory], normaliser: Normaliser, support: SupportSet
-) -> float:
-    """Share of visited states off the support, in 0 … 1."""
-    distances = nearest_distance(support.points, visited_states(trajectories, normaliser))
-    return float((distances > support.threshold).float().mean())
+def off_support_share(trajectories: Sequence[Trajectory], checkpoint: Checkpoint) -> float:
+    """Share of visited states off the checkpoint's support, in 0 … 1."""
+    states = visited_states(trajectories, checkpoint.state_normaliser)
+    distances = nearest_distance(checkpoint.support.points, states)
+    return float((distances > checkpoint.support.threshold).float().mean())

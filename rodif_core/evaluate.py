@@ -88,9 +88,7 @@ def summarise(checkpoint: Checkpoint, trajectories: Sequence[Trajectory]) -> Eva
         n=len(outcomes),
         successes=sum(bool(o["success"]) for o in outcomes),
         aligned=sum(aligned),
-        off_support=off_support_share(
-            trajectories, checkpoint.policy.normaliser, checkpoint.support
-        ),
+        off_support=off_support_share(trajectories, checkpoint),
         groups=_counts(o["group"] or "none" for o in outcomes),
         modes=_counts(o["mode"] for o in outcomes if o["mode"] is not None),
         reasons=_counts(o["reason"] for o in outcomes),

@@ -179,7 +179,7 @@ def _try(
     """Fresh rollouts of a policy; all trials of a round use the same seeds."""
     settings = RolloutConfig(config.guide.selection_rollouts, _fresh_seed(config))
     rollouts = rollout(replace(checkpoint, policy=policy), settings)
-    off = off_support_share(rollouts, checkpoint.policy.normaliser, checkpoint.support)
+    off = off_support_share(rollouts, checkpoint)
     success = float(np.mean([trajectory.success for trajectory in rollouts]))
     return Trial(
         scale,
@@ -244,8 +244,7 @@ def near_data(
 
     Without this a narrow way beside the demonstrations could become the policy's favourite.
     """
-    policy, support = checkpoint.policy, checkpoint.support
-    off = [off_support_share([one], policy.normaliser, support) for one in trajectories]
+    off = [off_support_share([one], checkpoint) for one in trajectories]
     order = np.argsort(off, kind="stable")
     count = max(sum(share <= limit for share in off), (len(off) + 1) // 2)
     return [trajectories[i] for i in sorted(order[:count].tolist())]

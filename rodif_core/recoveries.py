@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rodif_core.diffusion.chain import noise_entries
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint
+from rodif_core.sight import Sight
 from rodif_core.tasks import get_task
 from rodif_core.tasks.base import Task
 from rodif_core.tasks.env import BatchEnv
@@ -38,6 +39,7 @@ class _Run:
     rng: np.random.Generator
     context: dict[str, Any]
     takeover: int
+    rows: list[NDArray[np.float32]]  # what the policy reads
     observations: list[NDArray[np.float32]]
     qpos: list[NDArray[np.float32]]
     paths: list[NDArray[np.float32]]
@@ -57,27 +59,31 @@ def make_recoveries(checkpoint: Checkpoint, *, episodes: int, seed: int) -> list
         raise ValueOutOfRangeError("episodes", episodes, "at least 1")
     if seed < 0:
         raise ValueOutOfRangeError("seed", seed, "0 or more")
-    task = get_task(checkpoint.task)
+    task, policy = get_task(checkpoint.task), checkpoint.policy
     made: list[Trajectory] = []
-    for first in range(0, episodes, PARALLEL):
-        indices = range(first, min(first + PARALLEL, episodes))
-        made += _take_over(checkpoint, task, seed, indices)
+    with Sight(task, policy.config, policy.encoder) as sight:
+        for first in range(0, episodes, PARALLEL):
+            indices = range(first, min(first + PARALLEL, episodes))
+            made += _take_over(checkpoint, sight, seed, indices)
     return made
 
 
 def _take_over(
-    checkpoint: Checkpoint, task: Task, seed: int, indices: Sequence[int]
+    checkpoint: Checkpoint, sight: Sight, seed: int, indices: Sequence[int]
 ) -> list[Trajectory]:
+    task = get_task(checkpoint.task)
     env = BatchEnv(task, len(indices))
     generators = [np.random.default_rng([seed, index]) for index in indices]
     contexts = [task.sample_context(rng) for rng in generators]
     observations = env.reset(contexts)
     qpos, paths = env.qpos, env.paths
+    rows = sight.rows(observations, qpos)
     runs = [
         _Run(
             rng=rng,
             context=context,
             takeover=int(rng.integers(1, int(LATEST * task.max_steps))),
+            rows=[rows[i]],
             observations=[observations[i]],
             qpos=[qpos[i]],
             paths=[paths[i]],
@@ -93,11 +99,15 @@ def _take_over(
         actions = _actions(checkpoint, task, runs, active, chunks)
         observations = env.step(actions)
         qpos, paths, steps = env.qpos, env.paths, env.steps
+        driving = [i for i in active if runs[i].expert is None]
+        if driving:
+            rows[driving] = sight.rows(observations[driving], qpos[driving])
         for i in active:
             run = runs[i]
             if steps[i] > len(run.actions):  # not so when the physics diverged
                 run.actions.append(actions[i].copy())
                 run.observations.append(observations[i])
+                run.rows.append(rows[i].copy())
                 run.qpos.append(qpos[i])
                 run.paths.append(paths[i])
     outcomes = env.outcomes()
@@ -145,7 +155,7 @@ def _decide(checkpoint: Checkpoint, runs: Sequence[_Run]) -> NDArray[np.float32]
 
 
 def _history(run: _Run, steps: int) -> NDArray[np.float32]:
-    recent = run.observations[-steps:]
+    recent = run.rows[-steps:]
     return np.stack([recent[0]] * (steps - len(recent)) + recent)
 
 

@@ -18,6 +18,7 @@ from rodif_core.diffusion.chain import noise_entries
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
+from rodif_core.sight import Sight
 from rodif_core.spec import RolloutConfig
 from rodif_core.tasks import get_task
 from rodif_core.tasks.base import Task
@@ -43,28 +44,30 @@ def rollout(
         raise ValueOutOfRangeError("noise_scale", noise_scale, "in [0, 1]")
     task = get_task(checkpoint.task)
     done: list[Trajectory] = []
-    for first in range(0, config.episodes, config.max_parallel):
-        count = min(config.max_parallel, config.episodes - first)
-        seeds = [config.seed + first + i for i in range(count)]
-        done += _rollout_batch(checkpoint, task, seeds, noise_scale)
-        if progress is not None:
-            progress(len(done), config.episodes)
+    with Sight(task, checkpoint.policy.config, checkpoint.policy.encoder) as sight:
+        for first in range(0, config.episodes, config.max_parallel):
+            count = min(config.max_parallel, config.episodes - first)
+            seeds = [config.seed + first + i for i in range(count)]
+            done += _rollout_batch(checkpoint, sight, seeds, noise_scale)
+            if progress is not None:
+                progress(len(done), config.episodes)
     return done
 
 
 class _Recorder:
-    """Growing record of one episode."""
+    """Growing record of one episode. `rows` are what the policy reads, see `Sight`."""
 
-    def __init__(self, observation: Any, qpos: Any, path: Any) -> None:
+    def __init__(self, observation: Any, qpos: Any, path: Any, row: Any) -> None:
         self.observations, self.qpos, self.paths = [observation], [qpos], [path]
+        self.rows = [row]
         self.actions: list[NDArray[np.float32]] = []
         self.histories: list[NDArray[np.float32]] = []
         self.chains: list[NDArray[np.float32]] = []
         self.decision_steps: list[int] = []
 
     def history(self, steps: int) -> NDArray[np.float32]:
-        """Last `steps` observations (To, O); before the start the first one is repeated."""
-        recent = self.observations[-steps:]
+        """Last `steps` rows (To, O); before the start the first one is repeated."""
+        recent = self.rows[-steps:]
         return np.stack([recent[0]] * (steps - len(recent)) + recent)
 
     def decide(self, history: NDArray[np.float32], chain: NDArray[np.float32]) -> None:
@@ -73,8 +76,9 @@ class _Recorder:
         self.histories.append(history)
         self.chains.append(chain)
 
-    def step(self, action: Any, observation: Any, qpos: Any, path: Any) -> None:
+    def step(self, action: Any, observation: Any, qpos: Any, path: Any, row: Any) -> None:
         """Note one executed control step."""
+        self.rows.append(row)
         self.actions.append(action)
         self.observations.append(observation)
         self.qpos.append(qpos)
@@ -82,16 +86,17 @@ class _Recorder:
 
 
 def _rollout_batch(
-    checkpoint: Checkpoint, task: Task, seeds: list[int], noise_scale: float
+    checkpoint: Checkpoint, sight: Sight, seeds: list[int], noise_scale: float
 ) -> list[Trajectory]:
-    policy = checkpoint.policy
+    task, policy = get_task(checkpoint.task), checkpoint.policy
     size = policy.config
     contexts = [task.sample_context(np.random.default_rng([seed, 0])) for seed in seeds]
     generators = [_noise_generator(seed) for seed in seeds]
     env = BatchEnv(task, len(seeds))
     observations = env.reset(contexts)
     qpos, paths = env.qpos, env.paths
-    records = [_Recorder(observations[i], qpos[i], paths[i]) for i in range(len(seeds))]
+    rows = sight.rows(observations, qpos)
+    records = [_Recorder(observations[i], qpos[i], paths[i], rows[i]) for i in range(len(seeds))]
     chunks = np.zeros((len(seeds), size.executed_steps, size.action_dim), dtype=np.float32)
     step = 0
     while not env.done.all():
@@ -102,11 +107,14 @@ def _rollout_batch(
         actions = task.clip(chunks[:, offset])
         observations = env.step(actions)
         qpos, paths, steps_done = env.qpos, env.paths, env.steps
-        for i in active:
-            # A step in which the physics diverged never happened: its state is not finite.
-            if steps_done[i] > step:
-                records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i])
         step += 1
+        # A step in which the physics diverged never happened: its state is not finite.
+        moved = active[steps_done[active] == step]
+        # Other rows than the last before a decision are never read.
+        if len(moved) and -step % size.executed_steps < size.observation_steps:
+            rows[moved] = sight.rows(observations[moved], qpos[moved])
+        for i in moved:
+            records[i].step(actions[i].copy(), observations[i], qpos[i], paths[i], rows[i].copy())
     outcomes = env.outcomes()
     digest = checkpoint.digest  # hashes all weights
     return [

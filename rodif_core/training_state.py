@@ -1,4 +1,4 @@
-"""Partial state of a training loop on disk, so that a killed run goes on where it was.
+"""What training loops share: the rate, and partial state on disk, so that a killed run goes on.
 
 One safetensors file (parameters, averages, Adam moments) with a JSON header; written to a
 temporary file and renamed, so a kill in the middle leaves the older state.
@@ -7,7 +7,9 @@ temporary file and renamed, so a kill in the middle leaves the older state.
 from __future__ import annotations
 
 import json
+import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,16 @@ import safetensors.torch
 import torch
 from safetensors import safe_open
 from torch import Tensor, nn
+
+Progress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
+
+
+def cosine_rate(update: int, warm_up: int, updates: int) -> float:
+    """Factor of the learning rate: linear to 1 over `warm_up` updates, then a cosine to 0."""
+    if update < warm_up:
+        return (update + 1) / warm_up
+    fraction = (update - warm_up) / max(1, updates - warm_up)
+    return 0.5 * (1 + math.cos(math.pi * fraction))
 
 
 def save_state(

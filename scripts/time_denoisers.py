@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rodif_core.policies.policy import build_denoiser
 from rodif_core.policies.resnet import ImageConfig, ImageEncoder
-from rodif_core.pretrain import PRESETS
+from rodif_core.presets import PRESETS
 
 OBSERVATION_DIM, ACTION_DIM = 10, 2  # as in Pushing and Sorting
 PROPRIOCEPTION_DIM = 6

@@ -23,19 +23,23 @@ from rodif_core.spec import TaskName, parse_name
 
 FORMAT = "rodif-checkpoint-1"
 _WEIGHTS = "denoiser."
-_ENCODER = "encoder."  # only in policies that see images
+# Only in policies that see images.
+_ENCODER = "encoder."
+_STATES = "support.normaliser."
 
 
 @dataclass(frozen=True, eq=False)
 class SupportSet:
     """States that the demonstrations and the reference policy visit, for the drift measure.
 
-    points (P, O) normalised observations; threshold: the 99th percentile of the distance of
-    held-out demonstration states to `points`.
+    points (P, S) normalised observations of the task; threshold: the 99th percentile of the
+    distance of held-out demonstration states to `points`. A policy that sees pictures reads other
+    rows than the task's observations; `normaliser` is then that of the observations.
     """
 
     points: Tensor
     threshold: float
+    normaliser: Normaliser | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,11 @@ class Checkpoint:
     def digest(self) -> str:
         """SHA-256 of the weights and of all that decides behaviour (not of the card)."""
         return _digest(self)
+
+    @property
+    def state_normaliser(self) -> Normaliser:
+        """Scales the task's observations, as the support set's points are."""
+        return self.support.normaliser or self.policy.normaliser
 
 
 def save_checkpoint(checkpoint: Checkpoint) -> bytes:
@@ -101,6 +110,8 @@ def _tensors(checkpoint: Checkpoint) -> dict[str, Tensor]:
     if policy.encoder is not None:
         for name, value in policy.encoder.state_dict().items():
             tensors[_ENCODER + name] = value
+    if checkpoint.support.normaliser is not None:
+        tensors |= checkpoint.support.normaliser.tensors(_STATES)
     return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 
 
@@ -125,7 +136,9 @@ def _rebuild(tensors: dict[str, Tensor], header: dict[str, Any]) -> Checkpoint:
     policy.denoiser.load_state_dict(_part(tensors, _WEIGHTS), strict=True)
     if policy.encoder is not None:
         policy.encoder.load_state_dict(_part(tensors, _ENCODER), strict=True)
-    support = SupportSet(tensors["support.points"], float(header["support_threshold"]))
+    scaled = any(name.startswith(_STATES) for name in tensors)
+    states = Normaliser.from_tensors(tensors, _STATES) if scaled else None
+    support = SupportSet(tensors["support.points"], float(header["support_threshold"]), states)
     task = parse_name(TaskName, header["task"], "task")
     return Checkpoint(task, policy, support, json.loads(header["card"]))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -37,12 +37,6 @@ class Normaliser:
         action = centre_and_scale(np.concatenate(actions))
         return cls(*observation, *action)
 
-    def with_features(self, count: int) -> Normaliser:
-        """The same, for observations followed by `count` image features, which stay as they are."""
-        centre = torch.cat([self.observation_centre, torch.zeros(count)])
-        scale = torch.cat([self.observation_scale, torch.ones(count)])
-        return replace(self, observation_centre=centre, observation_scale=scale)
-
     def observation(self, values: Tensor) -> Tensor:
         """(…, O) task units → normalised."""
         return (values - self.observation_centre) / self.observation_scale
@@ -55,12 +49,11 @@ class Normaliser:
         """(…, A) normalised → task units."""
         return values * self.action_scale + self.action_centre
 
-    def tensors(self) -> dict[str, Tensor]:
+    def tensors(self, prefix: str = "normaliser.") -> dict[str, Tensor]:
         """Named tensors for the checkpoint file."""
-        return {f"normaliser.{name}": value for name, value in vars(self).items()}
+        return {prefix + name: value for name, value in vars(self).items()}
 
     @classmethod
-    def from_tensors(cls, tensors: dict[str, Tensor]) -> Normaliser:
+    def from_tensors(cls, tensors: dict[str, Tensor], prefix: str = "normaliser.") -> Normaliser:
         """Inverse of `tensors`."""
-        names = cls.__dataclass_fields__
-        return cls(**{name: tensors[f"normaliser.{name}"] for name in names})
+        return cls(**{name: tensors[prefix + name] for name in cls.__dataclass_fields__})

@@ -158,8 +158,8 @@ class DiffusionPolicy:
         """Observation rows of a policy with images, in task units, each frame encoded once.
 
         proprioception (B, T, P) in task units, frames uint8 RGB (B, T, C, H, W, 3) → (B, T, O).
-        Differentiable; the features are within ±1 and the normaliser leaves them alone (see
-        `Normaliser.with_features`). Raises LearningError for a policy without images.
+        Differentiable; the features are within ±1. Raises LearningError for a policy without
+        images.
         """
         if self.encoder is None:
             raise LearningError("this policy has no image encoder: its config has no `images`")

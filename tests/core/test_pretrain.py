@@ -15,14 +15,8 @@ from rodif_core.errors import UnknownNameError
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import PolicyConfig, build_denoiser
 from rodif_core.policies.unet import UnetSize
-from rodif_core.pretrain import (
-    PRESETS,
-    TASK_ARCHITECTURES,
-    PretrainConfig,
-    Windows,
-    preset_for,
-    pretrain,
-)
+from rodif_core.presets import PRESETS, TASK_ARCHITECTURES, PretrainConfig, preset_for
+from rodif_core.pretrain import Windows, pretrain
 from rodif_core.spec import Architecture, TaskName
 from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
@@ -74,7 +68,7 @@ def test_held_out_loss_falls_when_it_trains(
     assert curve[-1]["held_out"] < 0.7 * curve[0]["held_out"]
     assert checkpoint.card["architecture"] == architecture
     size = checkpoint.policy.config
-    assert size == config.policy_config(4, 2)
+    assert size == config.policy_config(get_task(TaskName.AVOID))
     actions, _ = checkpoint.policy.act(
         torch.zeros(1, size.observation_steps, 4),
         torch.zeros(1, size.denoising_steps, size.predicted_steps, 2),
@@ -95,7 +89,7 @@ def test_held_out_loss_falls_when_it_trains(
 def test_presets_have_the_shapes_of_the_paper(
     architecture: Architecture, name: str, shape: tuple[int, ...]
 ) -> None:
-    config = PRESETS[architecture][name].policy_config(10, 2)
+    config = PRESETS[architecture][name].policy_config(get_task(TaskName.AVOID))
     assert config.architecture is architecture
     assert shape == (
         config.observation_steps,
@@ -107,7 +101,7 @@ def test_presets_have_the_shapes_of_the_paper(
 
 @pytest.mark.parametrize(
     ("architecture", "name", "weights"),
-    # With 10 observation and 2 action dims, as in Pushing and Sorting.
+    # With 10 observation and 2 action dims.
     [
         (Architecture.UNET, "cpu", 165_810),
         (Architecture.UNET, "paper", 34_169_250),
@@ -121,7 +115,8 @@ def test_presets_have_the_documented_number_of_weights(
     architecture: Architecture, name: str, weights: int
 ) -> None:
     with torch.device("meta"):  # shapes without memory
-        denoiser = build_denoiser(PRESETS[architecture][name].policy_config(10, 2))
+        shape = PRESETS[architecture][name].policy_config(get_task(TaskName.AVOID))
+        denoiser = build_denoiser(replace(shape, observation_dim=10))
     assert sum(value.numel() for value in denoiser.parameters()) == weights
     text = (Path(__file__).parents[2] / "docs" / "architectures.md").read_text()
     assert f"| `{architecture}` | `{name}` |" in text

@@ -12,7 +12,8 @@ from rodif_core.demonstrations import make_demonstrations
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
 from rodif_core.policies.unet import UnetSize
-from rodif_core.pretrain import PretrainConfig, pretrain
+from rodif_core.presets import PretrainConfig
+from rodif_core.pretrain import pretrain
 from rodif_core.recoveries import make_recoveries
 from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import TaskName

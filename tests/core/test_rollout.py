@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -141,12 +143,12 @@ def test_support_in_many_dimensions_stays_small() -> None:
 def test_off_support_share_is_zero_on_the_support_and_rises_away_from_it(
     episodes: list[Trajectory],
 ) -> None:
-    normaliser = tiny_checkpoint().policy.normaliser
-    states = visited_states(episodes, normaliser)
+    checkpoint = tiny_checkpoint()
+    states = visited_states(episodes, checkpoint.policy.normaliser)
     near = fit_support(states, states + 0.01)
-    assert off_support_share(episodes, normaliser, near) == 0.0
+    assert off_support_share(episodes, replace(checkpoint, support=near)) == 0.0
     far = fit_support(states + 10, states + 10.01)
-    assert off_support_share(episodes, normaliser, far) == 1.0
+    assert off_support_share(episodes, replace(checkpoint, support=far)) == 1.0
 
 
 def facts(success: float, off: float, upper: float | None = None) -> dict:

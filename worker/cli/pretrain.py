@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from rodif_core.policies.checkpoint import Checkpoint
-    from rodif_core.pretrain import PretrainConfig
+    from rodif_core.presets import PretrainConfig
 
 RECOVERY_SEEDS = 500_000_000  # first seed of takeovers
-PRESET_NAMES = ("cpu", "paper")  # of rodif_core.pretrain, which the help does not load
+PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from rich.progress import Progress
 
     from rodif_core.policies.checkpoint import save_checkpoint
-    from rodif_core.pretrain import preset_for
+    from rodif_core.presets import preset_for
 
     task_name = TaskName(args.task)
     config = replace(preset_for(task_name, args.preset), seed=args.seed)

@@ -145,13 +145,13 @@ def policy_of(task: TaskName) -> Checkpoint:
     from rodif_core.policies.checkpoint import Checkpoint, SupportSet, load_checkpoint
     from rodif_core.policies.normaliser import Normaliser
     from rodif_core.policies.policy import DiffusionPolicy
-    from rodif_core.pretrain import preset_for
+    from rodif_core.presets import preset_for
     from rodif_core.tasks import get_task
 
     if task in shipped_tasks():
         return load_checkpoint(shipped_checkpoint(task))
     scene = get_task(task)
-    config = preset_for(task, "cpu").policy_config(scene.observation_dim, scene.action_dim)
+    config = preset_for(task, "cpu").policy_config(scene)
     limits = np.broadcast_to(np.asarray(scene.action_limit, np.float32), (scene.action_dim,))
     middle, span = torch.zeros(scene.observation_dim), torch.ones(scene.observation_dim)
     scales = Normaliser(middle, span, torch.zeros(scene.action_dim), torch.tensor(limits.copy()))

@@ -1,0 +1,180 @@
+"""Teach an image encoder where things are, before a policy learns to act on its features.
+
+From pixels to actions in one go, a policy needs many passes over many pictures. The simulation
+knows what a picture shows, so the encoder learns that first, from moments drawn evenly out of all
+demonstrations; then it is frozen, every frame is encoded once, and the denoiser trains on rows of
+numbers, as in a task without pictures. (The paper trains both together.)
+
+Legend: R moments, S observation dims of the task, P of them proprioception, C cameras, H x W
+pixels, O = P + features.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rodif_core.errors import LearningError, ValueOutOfRangeError
+from rodif_core.policies.normaliser import Normaliser
+from rodif_core.policies.policy import PolicyConfig
+from rodif_core.policies.resnet import ImageConfig, ImageEncoder
+from rodif_core.sight import Sight, draw
+from rodif_core.tasks.base import Task
+from rodif_core.tasks.camera import Camera
+from rodif_core.training_state import Progress, cosine_rate, load_state, save_state
+from rodif_core.trajectory import Trajectory
+
+SAVE_EVERY = 250  # updates between partial states
+REPORT_EVERY = 50
+HELD_OUT_MOMENTS = 256
+HEAD_WIDTH = 128  # hidden units between the features and what they are to tell
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """How the encoder is trained. Defaults: the CPU preset."""
+
+    moments: int = 20_000  # pictures of how many states, at most; 55 KB each
+    updates: int = 4_000
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    warm_up: int = 200
+
+    def __post_init__(self) -> None:
+        for name in ("moments", "updates", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """frames (R, C, H, W, 3) uint8, felt (R, P) and hidden (R, S - P), both normalised: what the
+    robot knows of itself, and what the pictures are to tell."""
+
+    frames: Tensor
+    felt: Tensor
+    hidden: Tensor
+
+    @classmethod
+    def draw(
+        cls,
+        task: Task,
+        demonstrations: Sequence[Trajectory],
+        images: ImageConfig,
+        states: Normaliser,
+        count: int,
+    ) -> Moments:
+        """`count` states, or all if there are fewer, evenly spaced over the demonstrations."""
+        qpos = np.concatenate([one.qpos for one in demonstrations])
+        rows = np.concatenate([one.observations for one in demonstrations])
+        chosen = np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)
+        with Camera(task, images.pixels, images.pixels) as camera:
+            frames = draw(camera, task, qpos[chosen])
+        normalised = states.observation(torch.from_numpy(rows[chosen]))
+        felt, hidden = normalised.tensor_split([task.proprioception_dim], dim=1)
+        return cls(torch.from_numpy(frames), felt, hidden)
+
+    def pick(self, rows: Tensor, device: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Frames, felt and hidden of those rows, on the device."""
+        return (
+            self.frames[rows].to(device),
+            self.felt[rows].to(device),
+            self.hidden[rows].to(device),
+        )
+
+
+class _Telling(nn.Module):
+    """Encoder and head: from pictures and proprioception to the hidden part of the state."""
+
+    def __init__(self, images: ImageConfig, felt: int, hidden: int) -> None:
+        super().__init__()
+        self.encoder = ImageEncoder(images)
+        self.head = nn.Sequential(
+            nn.Linear(felt + images.feature_dim, HEAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(HEAD_WIDTH, hidden),
+        )
+
+    def error(self, frames: Tensor, felt: Tensor, hidden: Tensor) -> Tensor:
+        """Mean squared error of what is told, in units of the observations' half ranges."""
+        rows = self.encoder(felt[:, None], frames[:, None])[:, 0]
+        return F.mse_loss(self.head(rows), hidden)
+
+
+def train_encoder(
+    task: Task,
+    known: Sequence[Trajectory],
+    held_out: Sequence[Trajectory],
+    images: ImageConfig,
+    config: EncoderConfig,
+    *,
+    seed: int,
+    workspace: Path | None = None,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> tuple[ImageEncoder, list[dict[str, float]]]:
+    """A trained encoder and its curve; goes on from `workspace` when a partial state is there.
+
+    Raises LearningError when the loss is not finite and GraphicsError where nothing can be drawn.
+    """
+    states = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
+    seen = Moments.draw(task, known, images, states, config.moments)
+    unseen = Moments.draw(task, held_out, images, states, HELD_OUT_MOMENTS)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = _Telling(images, seen.felt.shape[1], seen.hidden.shape[1]).to(device)
+    optimizer = torch.optim.AdamW(
+        model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+    )
+    state_file = workspace / "encoder.safetensors" if workspace is not None else None
+    modules: dict[str, nn.Module] = {"model": model}
+    facts = load_state(state_file, modules, optimizer) if state_file is not None else None
+    start, curve = (facts["update"], facts["curve"]) if facts else (0, [])
+    for update in range(start, config.updates):
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + update)
+        for group in optimizer.param_groups:
+            group["lr"] = config.learning_rate * cosine_rate(update, config.warm_up, config.updates)
+        pick = torch.randint(len(seen.felt), (config.batch_size,), generator=generator)
+        loss = model.error(*seen.pick(pick, device))
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        if update % REPORT_EVERY == 0 or update == config.updates - 1:
+            curve.append(_report(model, float(loss.detach()), unseen, update, device))
+            if progress is not None:
+                progress(update + 1, config.updates, curve[-1])
+        if state_file is not None and (update + 1) % SAVE_EVERY == 0:
+            save_state(state_file, modules, optimizer, {"update": update + 1, "curve": curve})
+    return model.encoder.cpu().eval().requires_grad_(False), curve
+
+
+@torch.no_grad()
+def _report(
+    model: _Telling, loss: float, unseen: Moments, update: int, device: str
+) -> dict[str, float]:
+    if not math.isfinite(loss):
+        raise LearningError(f"the encoder's loss became {loss} at update {update}")
+    held_out = float(model.error(*unseen.pick(torch.arange(len(unseen.felt)), device)))
+    return {"update": float(update), "loss": loss, "held_out": held_out}
+
+
+def encode(
+    task: Task,
+    shape: PolicyConfig,
+    encoder: ImageEncoder | None,
+    demonstrations: Sequence[Trajectory],
+) -> list[Trajectory]:
+    """The demonstrations with the rows (N + 1, O) that a policy reads as their observations."""
+    with Sight(task, shape, encoder) as sight:
+        return [
+            replace(one, observations=sight.rows(one.observations, one.qpos))
+            for one in demonstrations
+        ]

@@ -1,0 +1,164 @@
+"""How policies are pretrained: the sizes and settings of every task, by name.
+
+Legend: K denoising steps, To observation history, Tp predicted and Te executed chunk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from rodif_core.encoder_training import EncoderConfig
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.policies.mlp import MlpSize
+from rodif_core.policies.policy import PolicyConfig, Size
+from rodif_core.policies.resnet import ImageConfig
+from rodif_core.policies.transformer import TransformerSize
+from rodif_core.policies.unet import UnetSize
+from rodif_core.spec import Architecture, TaskName
+from rodif_core.tasks.base import Task
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """How a policy is pretrained: its shape, but for the task's dims, and the training.
+
+    Defaults: the CPU preset of the U-Net, with which Avoid's shipped checkpoint was trained.
+    """
+
+    size: Size = UnetSize()  # widths; its type is the architecture
+    observation_steps: int = 2  # To
+    predicted_steps: int = 16  # Tp
+    executed_steps: int = 8  # Te: control steps between two decisions of the policy
+    denoising_steps: int = 20  # K
+    updates: int = 10_000
+    batch_size: int = 128
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-6
+    warm_up: int = 200
+    ema_decay: float = 0.999
+    held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
+    images: ImageConfig | None = None  # for tasks with cameras
+    encoder: EncoderConfig = EncoderConfig()  # how their encoder is trained
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.held_out < 0.5:
+            raise ValueOutOfRangeError("held_out", self.held_out, "in (0, 0.5)")
+        if self.updates < 1:
+            raise ValueOutOfRangeError("updates", self.updates, "at least 1")
+
+    def policy_config(self, task: Task) -> PolicyConfig:
+        """The policy's shape for a task.
+
+        Raises ValueOutOfRangeError for pictures of a task without cameras, and the reverse.
+        """
+        if (self.images.cameras if self.images else 0) != len(task.cameras):
+            raise ValueOutOfRangeError(
+                "images",
+                self.images,
+                f"{len(task.cameras)} cameras, as task {task.name.value!r} has",
+            )
+        rows = task.observation_dim
+        if self.images is not None:
+            rows = task.proprioception_dim + self.images.feature_dim
+        return PolicyConfig(
+            rows,
+            task.action_dim,
+            self.observation_steps,
+            self.predicted_steps,
+            self.executed_steps,
+            self.denoising_steps,
+            self.size,
+            self.images,
+        )
+
+
+# The architecture of each task, by name (paper, Table 1).
+TASK_ARCHITECTURES: dict[str, Architecture] = {
+    "avoid": Architecture.UNET,
+    "pushing": Architecture.UNET,
+    "sorting": Architecture.TRANSFORMER,
+    "aligning": Architecture.MLP,
+    "aligning-state": Architecture.MLP,
+    "stacking": Architecture.TRANSFORMER,
+    "stacking-state": Architecture.TRANSFORMER,
+}
+
+# To, Tp and K are the paper's (appendix, architectures and training hyperparameters); Te is ours
+# but for the single action. Where the sizes come from is told in docs/architectures.md.
+_TRANSFORMER = PretrainConfig(
+    size=TransformerSize(),
+    observation_steps=5,
+    denoising_steps=16,
+    updates=40_000,
+    learning_rate=5e-4,
+    warm_up=500,
+)
+_MLP = PretrainConfig(
+    size=MlpSize(),
+    observation_steps=1,
+    predicted_steps=1,
+    executed_steps=1,
+    denoising_steps=4,
+    updates=60_000,
+    batch_size=512,
+)
+_PAPER: dict[str, Any] = {  # what a GPU is for: wide, long, large batches
+    "updates": 60_000,
+    "batch_size": 256,
+    "learning_rate": 1e-4,
+    "warm_up": 500,
+}
+PRESETS = {
+    Architecture.UNET: {
+        "cpu": PretrainConfig(),
+        "paper": PretrainConfig(size=UnetSize(channels=(256, 512, 1024)), **_PAPER),
+    },
+    Architecture.TRANSFORMER: {
+        "cpu": _TRANSFORMER,
+        "paper": replace(
+            _TRANSFORMER,
+            size=TransformerSize(
+                width=512, heads=8, encoder_layers=4, decoder_layers=7, feedforward=3200
+            ),
+            **_PAPER,
+        ),
+    },
+    Architecture.MLP: {
+        "cpu": _MLP,
+        "paper": replace(_MLP, size=MlpSize(width=256, blocks=4), **_PAPER | {"batch_size": 1024}),
+    },
+}
+
+
+# Pushing needs wider layers and more updates than Avoid, and both look again sooner: a cube that
+# turned away from the rod is lost within eight control steps.
+_TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
+    ("pushing", "cpu"): {
+        "size": UnetSize(channels=(32, 64, 128)),
+        "executed_steps": 4,
+        "updates": 25_000,
+    },
+    ("pushing", "paper"): {"executed_steps": 4},
+    ("sorting", "cpu"): {"executed_steps": 4, "updates": 30_000},
+    ("sorting", "paper"): {"executed_steps": 4},
+    **{(task, "cpu"): {"images": ImageConfig()} for task in ("aligning", "stacking")},
+    **{
+        (task, "paper"): {
+            "images": ImageConfig(width=64),
+            "encoder": EncoderConfig(
+                moments=100_000, updates=40_000, batch_size=256, learning_rate=3e-4
+            ),
+        }
+        for task in ("aligning", "stacking")
+    },
+}
+
+
+def preset_for(task: TaskName, name: str) -> PretrainConfig:
+    """The task's architecture in that preset; raises UnknownNameError listing the legal names."""
+    presets = PRESETS[TASK_ARCHITECTURES[task]]
+    if name not in presets:
+        raise UnknownNameError("preset", name, presets)
+    return replace(presets[name], **_TASK_CHANGES.get((task.value, name), {}))
