@@ -122,7 +122,7 @@ def test_the_command_measures_prints_and_writes(tmp_path: Path, capsys: pytest.C
     wish = ["--tasks", "avoid", "--episodes", "4", "--json", str(file)]
     assert main(["bench", "rollouts", *wish]) in (0, 1)  # so few reach no target for sure
     shown = capsys.readouterr().out
-    assert "plain loop" in shown and "raw physics" in shown
+    assert "per CPU second" in shown and "times the plain loop" in shown
     row = json.loads(file.read_text())[0]
     assert row["task"] == "avoid" and row["policy"] == "shipped" and row["episodes"] == 4
     assert all(row[name] > 0 for name in ("batch_s", "physics_s", "network_s", "steps"))

@@ -222,7 +222,7 @@ def _time_rollouts(names: Sequence[str] | None, episodes: int, file: Path | None
     if file is not None:
         write_rows(file, [row.to_json() for row in rows])
     console = Console()
-    console.print(rollouts.rows_table(rows))
+    console.print(rollouts.rates_table(rows))
     console.print(rollouts.parts_table(rows))
     missed = rollouts.shortfalls(rows)
     for sentence in missed:

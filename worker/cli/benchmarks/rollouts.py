@@ -263,49 +263,57 @@ def network_seconds(checkpoint: Checkpoint, episodes: Sequence[Trajectory]) -> f
     return total
 
 
-def rows_table(rows: Sequence[Row]) -> Table:
-    """One line a task."""
+def _narrow_table(title: str) -> Table:
+    """A table without rules between its columns, which there are many of."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(
-        title="control steps per CPU second (episodes per CPU second)", title_justify="left"
-    )
-    for heading in ("task", "policy", "n a core"):
-        table.add_column(heading, no_wrap=True)
-    headings = ("1 core", "2 cores", "plain loop", "× plain, 1", "× plain, 2", "× parts")
+    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+
+
+def rates_table(rows: Sequence[Row]) -> Table:
+    """Episodes and control steps per CPU second, one line a task."""
+    table = _narrow_table("per CPU second")
+    table.add_column("task", no_wrap=True)
+    episodes = ("episodes\n1 core", "episodes\n2 cores")
+    headings = ("policy", "n", *episodes, "steps\n1 core", "steps\n2 cores", "steps\nplain")
     for heading in headings:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(
             row.task,
             row.policy,
             str(row.episodes),
-            *(f"{row.steps_per_s[c]:.0f} ({row.episodes_per_s(c):.1f})" for c in CORES),
+            *(f"{row.episodes_per_s(cores):.1f}" for cores in CORES),
+            *(f"{row.steps_per_s[cores]:.0f}" for cores in CORES),
             f"{row.plain_steps_per_s:.0f}",
-            *(f"{row.speedup(c):.1f}" for c in CORES),
-            f"{row.overhead:.2f}",
         )
     table.caption = (
-        "2 cores: a process each; plain loop: one simulation, one row of the policy; × parts: "
-        "seconds on one core in units of raw physics + raw network\n"
-        "random: no checkpoint is shipped; the CPU preset's network with fresh weights, so its "
-        "episodes run to their ends without pushing much"
+        "n episodes on each core; steps: control steps; plain: one simulation in a loop. random:"
+        " no checkpoint is shipped, the CPU preset has fresh weights, so its episodes run to their"
+        " ends and hardly touch anything"
     )
     return table
 
 
 def parts_table(rows: Sequence[Row]) -> Table:
-    """Where the time of one core goes, in µs of CPU a control step."""
-    from rich.table import Table
-
-    table = Table(title="µs of CPU per control step", title_justify="left")
+    """What is gained on the plain loop, and where one core's time goes, one line a task."""
+    table = _narrow_table("times the plain loop; µs of CPU a control step")
     table.add_column("task", no_wrap=True)
-    for heading in ("whole", "raw physics", "raw network", "all else"):
-        table.add_column(heading, justify="right")
+    gains = ("gain\n1 core", "gain\n2 cores")
+    headings = (*gains, "whole\nµs", "physics\nµs", "network\nµs", "all else\nµs", "whole/\nparts")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         parts = (row.batch_s, row.physics_s, row.network_s)
-        rest = parts[0] - parts[1] - parts[2]
-        table.add_row(row.task, *(f"{1e6 * part / row.steps:.0f}" for part in (*parts, rest)))
+        rest = row.batch_s - row.physics_s - row.network_s
+        table.add_row(
+            row.task,
+            *(f"{row.speedup(cores):.1f}" for cores in CORES),
+            *(f"{1e6 * part / row.steps:.0f}" for part in (*parts, rest)),
+            f"{row.overhead:.2f}",
+        )
+    table.caption = "physics and network: the same episodes' work alone; parts: their sum"
     return table
 
 
