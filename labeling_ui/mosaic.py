@@ -70,7 +70,7 @@ class Mosaic:
         self._tiles = [_Tile(task, one, self._picture, self._colours) for one in shown]
         self._task, self._mesh, self._stride = task, mesh, stride
         self._longest = max(len(one.actions) for one in shown)
-        height = HEADER + rows * (self._picture[1] + CAPTION + GAP) + GAP
+        height = HEADER + rows * (self._picture[1] + CAPTION + GAP)
         # Video codecs halve the resolution of colour, so both must be even.
         self._size = (width + width % 2, height + height % 2)
         self._page = Image.new("RGB", self._size, PAPER)

@@ -131,7 +131,7 @@ def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list
     columns = [np.stack(rows) for rows in (observations, actions, qpos, paths)]
     outcomes, steps = env.outcomes(), env.steps
     return [
-        _trajectory(
+        recorded_episode(
             task,
             columns=[column[:, i] for column in columns],
             length=int(steps[i]),
@@ -148,7 +148,7 @@ def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list
     ]
 
 
-def _trajectory(
+def recorded_episode(
     task: Task,
     columns: Sequence[NDArray[np.float32]],
     length: int,
@@ -156,7 +156,12 @@ def _trajectory(
     outcome: dict[str, Any],
     info: dict[str, Any],
 ) -> Trajectory:
-    """Cut one episode of `length` control steps out of its columns; it has no decisions."""
+    """One episode without decisions, cut out of what many steps recorded.
+
+    columns  observations, actions, qpos, paths, each with a row a control step
+    length   control steps of this episode
+    info     where it comes from; the task's facts are added
+    """
     observations, actions, qpos, paths = columns
     return episode_without_decisions(
         observations=observations[: length + 1].copy(),

@@ -69,6 +69,7 @@ class Camera:
         self._scene = mujoco.MjvScene(self._model, MAX_SHAPES)
         self._option = mujoco.MjvOption()
         self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._name = ""  # of the OpenGL that draws
         self._gl: Any = None
         self._context: mujoco.MjrContext | None = None
 
@@ -77,9 +78,11 @@ class Camera:
         """Names of the scene's cameras."""
         return [self._model.camera(i).name for i in range(self._model.ncam)]
 
-    def check(self) -> None:
-        """Make the OpenGL context, as the first picture would; raises GraphicsError."""
+    @property
+    def graphics(self) -> str:
+        """Which OpenGL draws, such as "egl"; made now if there is none. Raises GraphicsError."""
         self._begin()
+        return self._name
 
     def picture(
         self,
@@ -144,7 +147,7 @@ class Camera:
         if self._context is not None:
             self._gl.make_current()
             return
-        self._gl = _new_context(*self._size)
+        self._name, self._gl = _new_context(*self._size)
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -162,8 +165,8 @@ class Camera:
             self._scene.ngeom += 1
 
 
-def _new_context(width: int, height: int) -> Any:
-    """An off-screen OpenGL context of MuJoCo; raises GraphicsError saying what to install."""
+def _new_context(width: int, height: int) -> tuple[str, Any]:
+    """Name and off-screen OpenGL context of MuJoCo; raises GraphicsError saying what to install."""
     global _drew_in
     if _drew_in not in (None, os.getpid()):
         raise GraphicsError(
@@ -184,7 +187,7 @@ def _new_context(width: int, height: int) -> Any:
             f"cannot draw pictures with MUJOCO_GL={name}: {error}. " + _advice(packages)
         ) from error
     _drew_in = os.getpid()
-    return context
+    return name, context
 
 
 def _usual() -> str:

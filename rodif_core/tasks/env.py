@@ -207,6 +207,11 @@ class BatchEnv:
         return self._steps.copy()
 
     @property
+    def setpoints(self) -> NDArray[np.float64]:
+        """(m, S) where the controller is told to be, as `Task.move` takes them."""
+        return self._setpoints.copy()
+
+    @property
     def qpos(self) -> NDArray[np.float32]:
         """(m, Q) float32 positions of the physics."""
         return self._positions.astype(np.float32)

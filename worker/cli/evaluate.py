@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from rodif_core.errors import CheckpointFileError
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
+from worker.cli.options import add_json_argument, give_json
 
 
 def read_checkpoint(name: str) -> bytes:
@@ -36,7 +36,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--seed", type=int, default=0, help="rollout i uses SEED + i (default %(default)s)"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--processes", type=int, default=1, help="cores used (default %(default)s)")
+    add_json_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,18 +47,23 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from rodif_core.evaluate import evaluate
+    from rodif_core.evaluate import summarise
     from rodif_core.policies.checkpoint import load_checkpoint
     from worker.cli.tables import evaluation_table
+    from worker.parallel import parallel_rollout
 
     checkpoint = load_checkpoint(read_checkpoint(args.checkpoint))
     with Progress(console=Console(stderr=True), transient=True) as bar:
         row = bar.add_task("rollouts", total=config.episodes)
-        result = evaluate(
-            checkpoint, config, progress=lambda done, _: bar.update(row, completed=done)
-        ).to_json()
-    if args.json:
-        print(json.dumps(result | {"checkpoint": checkpoint.digest, "seed": args.seed}))
+        episodes = parallel_rollout(
+            checkpoint,
+            config,
+            args.processes,
+            progress=lambda done, _: bar.update(row, completed=done),
+        )
+    result = summarise(checkpoint, episodes).to_json()
+    facts = {"task": checkpoint.task.value, "checkpoint": checkpoint.digest, "seed": args.seed}
+    if give_json(result | facts, args.json):
         return 0
     console = Console()
     title = f"{checkpoint.task.value}, seeds {args.seed} … {args.seed + args.n - 1}"

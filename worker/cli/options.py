@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+from pathlib import Path
+from typing import Any
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -21,6 +24,27 @@ def add_connection_arguments(parser: argparse.ArgumentParser) -> None:
         help="bearer token rdf_… (or RODIF_TOKEN)",
     )
     parser.add_argument("--campaign", help="name or number; not needed when there is only one")
+
+
+PRINTED = Path("-")  # --json without a file
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """`--json` prints JSON in place of the table, `--json FILE` writes it beside the table."""
+    parser.add_argument(
+        "--json", type=Path, nargs="?", const=PRINTED, metavar="FILE", help="print or write JSON"
+    )
+
+
+def give_json(data: Any, where: Path | None) -> bool:
+    """Print or write as `add_json_argument` says; whether it was printed."""
+    if where == PRINTED:
+        print(json.dumps(data))
+        return True
+    if where is not None:
+        where.parent.mkdir(parents=True, exist_ok=True)
+        where.write_text(json.dumps(data, indent=1) + "\n")
+    return False
 
 
 def number_list(text: str) -> list[int]:

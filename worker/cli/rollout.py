@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rodif_core.errors import CheckpointFileError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
 from worker.cli.evaluate import read_checkpoint
+from worker.cli.options import add_json_argument, give_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--video",
         type=Path,
-        help="film of the first rollouts side by side (mp4, or webp for pages)",
+        help="film of the first rollouts (mp4; or webp, for pages)",
     )
     parser.add_argument(
         "--speed", type=int, default=1, help="of the film; 2: twice real time (default %(default)s)"
@@ -43,7 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--out", type=Path, help="file of the episodes (npz), which `rodif plot modes` draws"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_json_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,10 +57,14 @@ def run(args: argparse.Namespace) -> int:
     from labeling_ui.film import check_film_path
     from rodif_core.demonstrations import save_demonstrations
     from rodif_core.evaluate import summarise
+    from rodif_core.tasks import get_task
+    from rodif_core.tasks.camera import Camera
 
     if args.video is not None:
         check_film_path(args.video)
-        _check_graphics(TaskName(args.task))
+        # Told now and not after the rollouts.
+        with Camera(get_task(args.task), 32, 24) as camera:
+            _ = camera.graphics
     checkpoint = _checkpoint(TaskName(args.task), args.checkpoint)
     progress = Console(stderr=True)
     episodes = _rolled_out(checkpoint, config, args.processes, progress)
@@ -78,20 +82,9 @@ def run(args: argparse.Namespace) -> int:
     if args.video is not None:
         _film(args, report, episodes, progress)
     kept = {name: value for name, value in report.items() if not name.startswith("path")}
-    if args.json:
-        print(json.dumps(kept))
-    else:
+    if not give_json(kept, args.json):
         _print(kept, [path for path in (args.out, args.video) if path is not None])
     return 0
-
-
-def _check_graphics(task: TaskName) -> None:
-    """Raise GraphicsError now and not after the rollouts."""
-    from rodif_core.tasks import get_task
-    from rodif_core.tasks.camera import Camera
-
-    with Camera(get_task(task), 32, 24) as camera:
-        camera.check()
 
 
 def _checkpoint(task: TaskName, file: str | None) -> Checkpoint:

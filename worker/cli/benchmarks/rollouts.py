@@ -1,9 +1,9 @@
 """How quickly policies are rolled out, beside what the same work costs in its plainest forms.
 
-All rates are in CPU seconds of the process that works, which do not depend on what else the machine
+All rates are in CPU seconds of the process that works, which depend little on what else the machine
 does; with two processes those of the slower one count. The parts are measured on the same episodes:
 
-* batch: `rollout`, all episodes together, on one core
+* batch: `rollout`, n episodes together on one core; on two cores n on each
 * plain: one simulation in a loop, the policy called for one row at a time
 * physics: only the physics steps of those episodes, their joint positions replayed as targets
 * network: only the policy's calls of those episodes, on the histories that it saw
@@ -18,7 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
 
@@ -37,52 +37,64 @@ MOST_OVERHEAD = 2.0  # wanted: batch seconds in units of physics + network secon
 
 @dataclass(frozen=True)
 class Row:
-    """One task's figures; seconds are CPU seconds for all `episodes`.
+    """One task's figures.
 
-    policy: "shipped", or "random": the CPU preset's network with fresh weights
-    steps: control steps of all episodes together
-    batch_s: of the slowest process, by the number of processes
-    plain_steps_per_s: control steps per CPU second of the plain loop
+    policy             "shipped", or "random": the CPU preset's network with fresh weights
+    episodes           of one core
+    steps              control steps of those together
+    batch_s            CPU seconds of those on one core
+    steps_per_s        control steps per CPU second by the number of cores
+    plain_steps_per_s  the same of the plain loop
+    physics_s          CPU seconds of the episodes' physics alone
+    network_s          CPU seconds of their policy's calls alone
     """
 
     task: str
     policy: str
     episodes: int
     steps: int
-    batch_s: Mapping[int, float]
+    batch_s: float
+    steps_per_s: Mapping[int, float]
     plain_steps_per_s: float
     physics_s: float
     network_s: float
 
-    def steps_per_s(self, cores: int) -> float:
-        """Control steps a second."""
-        return self.steps / self.batch_s[cores]
-
     def episodes_per_s(self, cores: int) -> float:
-        """Episodes a second."""
-        return self.episodes / self.batch_s[cores]
+        """Episodes per CPU second, of this mean length."""
+        return self.steps_per_s[cores] * self.episodes / self.steps
 
     def speedup(self, cores: int) -> float:
         """Times as quick as the plain loop."""
-        return self.steps_per_s(cores) / self.plain_steps_per_s
+        return self.steps_per_s[cores] / self.plain_steps_per_s
 
     @property
     def overhead(self) -> float:
         """Seconds on one core in units of those that physics and network take alone."""
-        return self.batch_s[1] / (self.physics_s + self.network_s)
+        return self.batch_s / (self.physics_s + self.network_s)
 
     def to_json(self) -> dict[str, Any]:
         """The figures and what follows from them, as JSON types."""
         by_cores = {
-            name: {str(cores): round(measure(cores), 3) for cores in self.batch_s}
-            for name, measure in (
+            name: {str(cores): figure(cores) for cores in CORES}
+            for name, figure in (
+                ("steps_per_s", lambda cores: self.steps_per_s[cores]),
                 ("episodes_per_s", self.episodes_per_s),
-                ("steps_per_s", self.steps_per_s),
                 ("speedup", self.speedup),
             )
         }
-        plain = asdict(self) | {"batch_s": {str(k): v for k, v in self.batch_s.items()}}
-        return plain | by_cores | {"overhead": round(self.overhead, 3)}
+        return asdict(self) | by_cores | {"overhead": self.overhead}
+
+
+def legal_tasks(names: Sequence[str] | None) -> list[TaskName]:
+    """The named tasks, or all that can be timed; raises UnknownNameError for one that cannot."""
+    from rodif_core.tasks import TASKS
+
+    # With pictures, drawing and encoding them would be what is measured.
+    legal = [name for name, task in TASKS.items() if not task.cameras]
+    for name in names or []:
+        if name not in legal:
+            raise UnknownNameError("task without cameras", name, legal)
+    return [name for name in legal if names is None or name in names]
 
 
 def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
@@ -90,20 +102,18 @@ def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
     from rodif_core.rollout import rollout
     from rodif_core.tasks import get_task
 
-    if episodes < max(CORES):
-        raise ValueOutOfRangeError("episodes", episodes, f"at least {max(CORES)}")
+    if episodes < 2:
+        raise ValueOutOfRangeError("episodes", episodes, "at least 2")
     checkpoint = policy_of(task)
     config = RolloutConfig(episodes, SEED, max_parallel=episodes)
     rollout(checkpoint, replace(config, episodes=2))  # what happens once only is not measured
-    batch_s = {1: 0.0}
-    made: list[Trajectory] = []
-
-    def all_together() -> None:
-        made.extend(rollout(checkpoint, config))
-
-    batch_s[1] = cpu_seconds(all_together)
+    started = time.process_time()
+    made = rollout(checkpoint, config)
+    batch_s = time.process_time() - started
+    steps = sum(len(one.actions) for one in made)
+    rates = {1: steps / batch_s}
     for cores in CORES[1:]:
-        batch_s[cores] = _in_processes(checkpoint, config, cores, pool)
+        rates[cores] = _rate_in_processes(checkpoint, config, cores, pool)
     started = time.process_time()
     plain_steps = plain_loop(checkpoint, PLAIN_STEPS)
     plain_s = time.process_time() - started
@@ -111,8 +121,9 @@ def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
         task=task.value,
         policy="shipped" if task in shipped_tasks() else "random",
         episodes=episodes,
-        steps=sum(len(one.actions) for one in made),
+        steps=steps,
         batch_s=batch_s,
+        steps_per_s=rates,
         plain_steps_per_s=plain_steps / plain_s,
         physics_s=physics_seconds(get_task(task), made),
         network_s=network_seconds(checkpoint, made),
@@ -151,22 +162,20 @@ def policy_of(task: TaskName) -> Checkpoint:
     return Checkpoint(task, policy, support, {"kind": "fresh weights"})
 
 
-def _in_processes(
+def _rate_in_processes(
     checkpoint: Checkpoint, config: RolloutConfig, cores: int, pool: ProcessPoolExecutor
 ) -> float:
-    """CPU seconds of the slowest process when the episodes are shared out."""
+    """Control steps of all processes per CPU second of the slowest, with `config` on each."""
     from rodif_core.policies.checkpoint import save_checkpoint
 
     blob = save_checkpoint(checkpoint)
-    share = -(-config.episodes // cores)
-    parts = [
-        replace(config, episodes=min(share, config.episodes - first), seed=config.seed + first)
-        for first in range(0, config.episodes, share)
-    ]
-    return max(pool.map(_timed_rollout, [blob] * len(parts), parts))
+    parts = [replace(config, seed=config.seed + i * config.episodes) for i in range(cores)]
+    measured = list(pool.map(_timed_rollout, [blob] * cores, parts))
+    return sum(steps for steps, _ in measured) / max(seconds for _, seconds in measured)
 
 
-def _timed_rollout(checkpoint: bytes, config: RolloutConfig) -> float:
+def _timed_rollout(checkpoint: bytes, config: RolloutConfig) -> tuple[int, float]:
+    """Control steps, and the CPU seconds that they took."""
     import torch
 
     from rodif_core.policies.checkpoint import load_checkpoint
@@ -175,7 +184,9 @@ def _timed_rollout(checkpoint: bytes, config: RolloutConfig) -> float:
     torch.set_num_threads(1)
     loaded = load_checkpoint(checkpoint)
     rollout(loaded, replace(config, episodes=2))
-    return cpu_seconds(lambda: rollout(loaded, config))
+    started = time.process_time()
+    made = rollout(loaded, config)
+    return sum(len(one.actions) for one in made), time.process_time() - started
 
 
 def plain_loop(checkpoint: Checkpoint, least_steps: int) -> int:
@@ -230,7 +241,7 @@ def physics_seconds(task: Any, episodes: Sequence[Trajectory]) -> float:
     total = 0.0
     for step in range(int(lengths.max())):
         ids = np.flatnonzero(lengths > step)
-        ctrl[ids] = np.stack([episodes[i].qpos[step + 1][joints] for i in ids])
+        ctrl[ids] = np.stack([episodes[int(i)].qpos[step + 1][joints] for i in ids])
         total += cpu_seconds(functools.partial(batch.step, ids, physics_steps))
     return total
 
@@ -252,49 +263,57 @@ def network_seconds(checkpoint: Checkpoint, episodes: Sequence[Trajectory]) -> f
     return total
 
 
-def rows_table(rows: Sequence[Row]) -> Table:
-    """One line a task."""
+def _narrow_table(title: str) -> Table:
+    """A table without rules between its columns, which there are many of."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(
-        title="control steps per CPU second (episodes per CPU second)", title_justify="left"
-    )
-    for heading in ("task", "policy", "n"):
-        table.add_column(heading, no_wrap=True)
-    headings = ("1 core", "2 cores", "plain loop", "× plain, 1", "× plain, 2", "× parts")
+    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+
+
+def rates_table(rows: Sequence[Row]) -> Table:
+    """Episodes and control steps per CPU second, one line a task."""
+    table = _narrow_table("per CPU second")
+    table.add_column("task", no_wrap=True)
+    episodes = ("episodes\n1 core", "episodes\n2 cores")
+    headings = ("policy", "n", *episodes, "steps\n1 core", "steps\n2 cores", "steps\nplain")
     for heading in headings:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(
             row.task,
             row.policy,
             str(row.episodes),
-            *(f"{row.steps_per_s(c):.0f} ({row.episodes_per_s(c):.1f})" for c in CORES),
+            *(f"{row.episodes_per_s(cores):.1f}" for cores in CORES),
+            *(f"{row.steps_per_s[cores]:.0f}" for cores in CORES),
             f"{row.plain_steps_per_s:.0f}",
-            *(f"{row.speedup(c):.1f}" for c in CORES),
-            f"{row.overhead:.2f}",
         )
     table.caption = (
-        "2 cores: a process each; plain loop: one simulation, one row of the policy; × parts: "
-        "seconds on one core in units of raw physics + raw network\n"
-        "random: no checkpoint is shipped; the CPU preset's network with fresh weights, so its "
-        "episodes run to their ends without pushing much"
+        "n episodes on each core; steps: control steps; plain: one simulation in a loop. random:"
+        " no checkpoint is shipped, the CPU preset has fresh weights, so its episodes run to their"
+        " ends and hardly touch anything"
     )
     return table
 
 
 def parts_table(rows: Sequence[Row]) -> Table:
-    """Where the time of one core goes, in µs of CPU a control step."""
-    from rich.table import Table
-
-    table = Table(title="µs of CPU per control step", title_justify="left")
+    """What is gained on the plain loop, and where one core's time goes, one line a task."""
+    table = _narrow_table("times the plain loop; µs of CPU a control step")
     table.add_column("task", no_wrap=True)
-    for heading in ("whole", "raw physics", "raw network", "all else"):
-        table.add_column(heading, justify="right")
+    gains = ("gain\n1 core", "gain\n2 cores")
+    headings = (*gains, "whole\nµs", "physics\nµs", "network\nµs", "all else\nµs", "whole/\nparts")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
-        parts = (row.batch_s[1], row.physics_s, row.network_s)
-        rest = parts[0] - parts[1] - parts[2]
-        table.add_row(row.task, *(f"{1e6 * part / row.steps:.0f}" for part in (*parts, rest)))
+        parts = (row.batch_s, row.physics_s, row.network_s)
+        rest = row.batch_s - row.physics_s - row.network_s
+        table.add_row(
+            row.task,
+            *(f"{row.speedup(cores):.1f}" for cores in CORES),
+            *(f"{1e6 * part / row.steps:.0f}" for part in (*parts, rest)),
+            f"{row.overhead:.2f}",
+        )
+    table.caption = "physics and network: the same episodes' work alone; parts: their sum"
     return table
 
 
