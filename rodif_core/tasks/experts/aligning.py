@@ -56,7 +56,7 @@ INSIDE = Side(INNER - ROD_RADIUS, 0.012, 0.026)
 BEHIND = -0.085  # m ahead; outside the rod keeps this far behind the middle of the box
 OUTSIDE = Side(-HALF - ROD_RADIUS, BEHIND, 0.038)
 
-TURN = 0.05  # m of way that a turn by one radian counts for, in the choice of the wall; squared
+TURN = 0.05  # m of way per squared radian of turning, in the choice of the wall
 MOVE = 1.5  # m of way that a metre of the rod's own way to a wall counts for
 BEYOND = 0.035  # m behind the goal: what the box is steered to, so that it passes straight
 SLACK = 0.006  # m; passing the goal at this distance is as good as through its middle
