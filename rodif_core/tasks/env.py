@@ -151,8 +151,8 @@ class BatchEnv:
         """All physics steps of one control step; returns (touched, failed) of each simulation.
 
         Where contact does not end episodes, nothing counts as touched. A step's sensors describe
-        the state before it, hence the look at the last one; that of the state before the first step
-        is the previous control step's last.
+        the state before it, hence the look at the last state; that of the state before the first
+        step is the previous control step's last.
         """
         self._batch.warning[ids] = 0
         record = np.zeros((len(ids), self._physics_steps, self._sensors.shape[1]))

@@ -193,7 +193,7 @@ def _funnel(jaws: Array, goal: Array, cruise: float, aside: float) -> Array:
     # Near the goal small corrections to the side are always allowed.
     free = max(free, 1.0 - ramp(side, *FUNNEL))
     velocity = _toward(jaws, np.array([goal[0], goal[1], height]))
-    return velocity * np.array([free, free, 1.0])
+    return np.asarray(velocity * np.array([free, free, 1.0]))
 
 
 def _toward(point: Array, goal: Array) -> Array:
