@@ -41,7 +41,7 @@ def test_rise_of_thirty_points_with_success_kept_is_a_success():
 @pytest.mark.parametrize(
     ("after", "state", "message"),
     [
-        (evaluation(0.44, 0.9), "published", "a rise of at least 0.3"),
+        (evaluation(0.44, 0.9), "published", "a rise of at least 0.30"),
         (evaluation(0.7, 0.74), "published", "success fell from 0.750 to 0.740"),
         (evaluation(0.9, 0.9), "rejected", "not published: the round is rejected"),
     ],
@@ -49,6 +49,15 @@ def test_rise_of_thirty_points_with_success_kept_is_a_success():
 def test_anything_less_is_a_failure_that_says_why(after: dict[str, Any], state: str, message: str):
     (sentence,) = result(after, state).failures()
     assert message in sentence
+
+
+def test_where_most_is_as_preferred_two_fifths_of_the_rest_are_enough():
+    # 0.70 before leaves 0.30, of which 0.12 must be won.
+    before = evaluation(0.70, 0.75)
+    for alignment, failures in ((0.83, 0), (0.81, 1)):
+        one = result(evaluation(alignment, 0.9))
+        one.evaluations["before"] = before
+        assert len(one.failures()) == failures
 
 
 def test_json_has_the_four_policies_the_labels_and_the_seconds():

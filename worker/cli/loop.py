@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from worker.cli.client import Client
     from worker.cli.simulate import SimulationReport
 
-ALIGNMENT_GAIN = 0.30  # a demo that steers less has failed
+# A demo that steers less has failed; where the policy mostly does what is preferred already, two
+# fifths of what was missing are enough.
+ALIGNMENT_GAIN, GAP_SHARE = 0.30, 0.4
 MEASURES = ("success", "alignment", "alignment_of_successes", "off_support", "n", "intervals")
 COMPARED = (FinetuneMethod.RODIF, FinetuneMethod.DP_DPO)
 PATIENCE_SECONDS = 1800.0  # for one stage
@@ -77,10 +79,11 @@ class DemoResult:
         """Why the demo did not show what it is for; empty when it did."""
         before, after = self.evaluations["before"], self.evaluations["after"]
         found = []
-        if after["alignment"] - before["alignment"] < ALIGNMENT_GAIN:
+        wanted = min(ALIGNMENT_GAIN, GAP_SHARE * (1 - before["alignment"]))
+        if after["alignment"] - before["alignment"] < wanted:
             found.append(
                 f"alignment went from {before['alignment']:.3f} to {after['alignment']:.3f};"
-                f" a rise of at least {ALIGNMENT_GAIN} was expected"
+                f" a rise of at least {wanted:.2f} was expected"
             )
         if after["success"] < before["success"]:
             found.append(f"success fell from {before['success']:.3f} to {after['success']:.3f}")
