@@ -24,6 +24,8 @@ def facts() -> list[dict[str, Any]]:
         {
             "task": name.value,
             "observation_dim": task.observation_dim,
+            "cameras": list(task.cameras),
+            "proprioception_dim": task.proprioception_dim,
             "action_dim": task.action_dim,
             "action_limits": task.clip(np.full(task.action_dim, np.inf)).tolist(),
             "control_dt": task.control_dt,
@@ -46,19 +48,22 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(rows))
         return 0
 
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
     table = Table(
-        caption="obs and act: dims; limit: mm (of joints: mrad) per control step and axis; "
-        "--json names the modes"
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        caption="obs and act: dims, cam: cameras beside them; limit: mm (of joints: mrad) per "
+        "control step and axis; --json names the modes",
     )
     for heading in ("task", "obs", "act", "limit", "steps", "modes", "preferred", "shipped"):
         table.add_column(heading, no_wrap=True)
     for row in rows:
         table.add_row(
             row["task"],
-            str(row["observation_dim"]),
+            _observation(row),
             str(row["action_dim"]),
             # 12.5 for a rod; 60, 8 for seven joints and a gripper
             ", ".join(f"{1000 * limit:g}" for limit in dict.fromkeys(row["action_limits"])),
@@ -69,3 +74,10 @@ def run(args: argparse.Namespace) -> int:
         )
     Console().print(table)
     return 0
+
+
+def _observation(row: dict[str, Any]) -> str:
+    """Numbers that a policy is given, and the cameras that it looks through."""
+    if not row["cameras"]:
+        return str(row["observation_dim"])
+    return f"{row['proprioception_dim']}, {len(row['cameras'])} cam"

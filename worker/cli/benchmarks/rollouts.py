@@ -268,7 +268,7 @@ def _narrow_table(title: str) -> Table:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
 
 
 def rates_table(rows: Sequence[Row]) -> Table:
@@ -301,7 +301,7 @@ def parts_table(rows: Sequence[Row]) -> Table:
     table = _narrow_table("times the plain loop; µs of CPU a control step")
     table.add_column("task", no_wrap=True)
     gains = ("gain\n1 core", "gain\n2 cores")
-    headings = (*gains, "whole\nµs", "physics\nµs", "network\nµs", "all else\nµs", "whole/\nparts")
+    headings = (*gains, "whole\nµs", "physics\nµs", "network\nµs", "rest\nµs", "whole/\nparts")
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
