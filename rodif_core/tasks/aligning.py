@@ -87,7 +87,7 @@ class AligningStateTask(Task):
     modes: ClassVar[tuple[str, ...]] = ("inside", "outside")
     groups: ClassVar[tuple[str, ...]] = modes
     preferred_group: ClassVar[str] = "inside"
-    preferred_share: ClassVar[float] = 0.8
+    preferred_share: ClassVar[float] = 0.75
     criterion: ClassVar[str] = (
         "The robot should reach into the hollow box and bring it to its target from the inside."
     )
