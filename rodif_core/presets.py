@@ -145,7 +145,12 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     ("sorting", "paper"): {"executed_steps": 4},
     ("aligning-state", "cpu"): {"updates": 30_000},
     ("stacking-state", "cpu"): {"updates": 25_000},
-    **{(task, "cpu"): {"images": ImageConfig()} for task in ("aligning", "stacking")},
+    ("aligning", "cpu"): {
+        "images": ImageConfig(),
+        "encoder": EncoderConfig(moments=12_000, updates=3_000),
+        "updates": 20_000,
+    },
+    ("stacking", "cpu"): {"images": ImageConfig(), "updates": 25_000},
     **{
         (task, "paper"): {
             "images": ImageConfig(width=64),
