@@ -143,6 +143,8 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     ("pushing", "paper"): {"executed_steps": 4},
     ("sorting", "cpu"): {"executed_steps": 4, "updates": 30_000},
     ("sorting", "paper"): {"executed_steps": 4},
+    ("aligning-state", "cpu"): {"updates": 30_000},
+    ("stacking-state", "cpu"): {"updates": 25_000},
     **{(task, "cpu"): {"images": ImageConfig()} for task in ("aligning", "stacking")},
     **{
         (task, "paper"): {

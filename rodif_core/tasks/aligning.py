@@ -87,7 +87,7 @@ class AligningStateTask(Task):
     modes: ClassVar[tuple[str, ...]] = ("inside", "outside")
     groups: ClassVar[tuple[str, ...]] = modes
     preferred_group: ClassVar[str] = "inside"
-    preferred_share: ClassVar[float] = 0.8
+    preferred_share: ClassVar[float] = 0.75
     criterion: ClassVar[str] = (
         "The robot should reach into the hollow box and bring it to its target from the inside."
     )
@@ -248,7 +248,7 @@ def read_mode(path: Array, boxes: Array) -> str | None:
 
 
 def _add_box(spec: mujoco.MjSpec, name: str, *, opacity: float) -> None:
-    """A free hollow box; one that is not opaque is a picture only: it floats and touches nothing"""
+    """A free hollow box; one that is not opaque is a mere picture: it floats, touching nothing."""
     solid = opacity == 1.0
     body = spec.worldbody.add_body(name=name, pos=[0.5, 0.0, 0.0], gravcomp=0.0 if solid else 1.0)
     body.add_freejoint(name=f"{name}_joint")

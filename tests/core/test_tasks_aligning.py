@@ -36,13 +36,11 @@ from rodif_core.tasks.experts.aligning import (
     INSIDE,
     OUTSIDE,
     AligningExpert,
-    Goal,
     Side,
     inside,
     outside,
     push,
     steer,
-    way,
 )
 from rodif_core.tasks.panda import ROD_RADIUS
 
@@ -275,33 +273,18 @@ def test_unknown_modes_are_refused_with_the_legal_ones() -> None:
         TASK.group_of("up")
 
 
-def goal(x: float, y: float, turn: float = 0.0) -> Goal:
-    """A goal in the frame of a box that has room on all sides."""
-    return Goal((x, y), turn, base=(0.0, -0.55))
-
-
 def test_steering_turns_towards_the_goal_and_goes_straight_when_it_lies_ahead() -> None:
-    assert steer(0, goal(0.3, 0.0)) == pytest.approx(0.0, abs=1e-12)
-    assert steer(0, goal(0.3, 0.1)) > 0 > steer(0, goal(0.3, -0.1))
+    assert steer(0, (0.3, 0.0), 0.0) == pytest.approx(0.0, abs=1e-12)
+    assert steer(0, (0.3, 0.1), 0.0) > 0 > steer(0, (0.3, -0.1), 0.0)
     # Turned towards +x at the end: a way that swings out to the other side first.
-    assert steer(1, goal(0.0, 0.3, -0.8)) > 0 > steer(1, goal(0.0, 0.3, 0.8))
+    assert steer(1, (0.0, 0.3), -0.8) > 0 > steer(1, (0.0, 0.3), 0.8)
 
 
 @pytest.mark.parametrize("side", [INSIDE, OUTSIDE])
 def test_a_rod_at_its_place_pushes_straight(side: Side) -> None:
-    forward, sideways = push((side.contact, 0.0), goal(0.3, 0.0), side)
+    forward, sideways = push((side.contact, 0.0), (0.3, 0.0), 0.0, side)
     assert forward > 0.004
     assert sideways == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_way_that_would_leave_the_arms_reach_is_longer() -> None:
-    """The target lies straight ahead and is turned by half a turn: the box must swing out to one
-    side, and does so where the arm's base is not."""
-    rod, ahead = (0.0, 0.0), (0.0, 0.5)
-    for base_x in (-0.41, 0.41):
-        half_turn = Goal(ahead, math.pi, base=(base_x, 0.2))
-        left, right = way(2, rod, half_turn, INSIDE), way(0, rod, half_turn, INSIDE)
-        assert (left > right) == (base_x < 0)
 
 
 @given(
@@ -316,7 +299,7 @@ def test_the_experts_field_is_finite_and_within_the_limit(
     x: float, y: float, z: float, goal_x: float, goal_y: float, turn: float
 ) -> None:
     for field in (inside, outside):
-        velocity = field((x, y), z, goal(goal_x, goal_y, turn))
+        velocity = field((x, y), z, (goal_x, goal_y), turn)
         assert max(abs(part) for part in velocity) <= TASK.action_limit * math.sqrt(2)
 
 

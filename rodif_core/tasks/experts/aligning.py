@@ -39,16 +39,6 @@ FOOT_RADIUS = math.sqrt(2) * FOOT  # m from the middle of the box to its feet
 
 
 @dataclass(frozen=True)
-class Goal:
-    """Where the box should go, in its own frame: place and turn of the target, and where the arm's
-    base stands."""
-
-    place: Point
-    turn: float
-    base: Point
-
-
-@dataclass(frozen=True)
 class Side:
     """How to push from one side of the walls.
 
@@ -66,11 +56,8 @@ INSIDE = Side(INNER - ROD_RADIUS, 0.012, 0.026)
 BEHIND = -0.085  # m ahead; outside the rod keeps this far behind the middle of the box
 OUTSIDE = Side(-HALF - ROD_RADIUS, BEHIND, 0.038)
 
-TURN = 0.05  # m of way that a turn by one radian counts for, in the choice of the wall; squared
+TURN = 0.05  # m of way per squared radian of turning, in the choice of the wall
 MOVE = 1.5  # m of way that a metre of the rod's own way to a wall counts for
-ROOM = 2.0  # m of way that a metre out of reach counts for
-SWING = 0.35  # of the distance to the goal: how far a way goes along its first and last headings
-REACH = (0.40, 0.72)  # m from the arm's base: where the middle of the box is safe
 BEYOND = 0.035  # m behind the goal: what the box is steered to, so that it passes straight
 SLACK = 0.006  # m; passing the goal at this distance is as good as through its middle
 NEAREST = 0.04  # m; the steering law has no bound at its goal
@@ -110,15 +97,12 @@ class AligningExpert:
         height = values[5]
         sine, cosine = values[8], values[9]
         rod = _turned(values[3] - values[6], values[4] - values[7], cosine, -sine)
-        goal = Goal(
-            place=_turned(values[10] - values[6], values[11] - values[7], cosine, -sine),
-            turn=math.atan2(values[12], values[13]) - math.atan2(sine, cosine),
-            base=_turned(-values[6], -values[7], cosine, -sine),
-        )
+        goal = _turned(values[10] - values[6], values[11] - values[7], cosine, -sine)
+        turn = math.atan2(values[12], values[13]) - math.atan2(sine, cosine)
         if self.mode == "inside":
-            vx, vy, vz = inside(rod, height, goal)
+            vx, vy, vz = inside(rod, height, goal, turn)
         else:
-            vx, vy, vz = outside(rod, height, goal)
+            vx, vy, vz = outside(rod, height, goal, turn)
         return np.array([*_turned(vx, vy, cosine, sine), vz])
 
     def to_json(self) -> dict[str, Any]:
@@ -126,12 +110,12 @@ class AligningExpert:
         return {"mode": self.mode, "tremble": self.tremble}
 
 
-def inside(rod: Point, height: float, goal: Goal) -> tuple[float, float, float]:
+def inside(rod: Point, height: float, goal: Point, turn: float) -> tuple[float, float, float]:
     """Velocity in the box's frame: over the middle, down, and against a wall from within."""
     off = math.hypot(*rod)
     within = max(abs(rod[0]), abs(rod[1])) < INNER and height < TOP
     if within:
-        vx, vy = push(rod, goal, INSIDE)
+        vx, vy = push(rod, goal, turn, INSIDE)
         deep = ramp(TOP - height, 0.0, DEEP)
         return deep * vx, deep * vy, _climb(LOW - height)
     wanted = LOW + (HOVER - LOW) * ramp(off, *OVER)
@@ -143,24 +127,24 @@ def inside(rod: Point, height: float, goal: Goal) -> tuple[float, float, float]:
     return speed * ux, speed * uy, _climb(wanted - height)
 
 
-def outside(rod: Point, height: float, goal: Goal) -> tuple[float, float, float]:
+def outside(rod: Point, height: float, goal: Point, turn: float) -> tuple[float, float, float]:
     """Velocity in the box's frame: down beside the box, round it, and against a wall."""
     if max(abs(rod[0]), abs(rod[1])) < OVERLAP:  # over the box or in it: get out first
         ux, uy = unit(*rod)
         speed = FREE_SPEED * ramp(height, TOP - 0.01, TOP + 0.01)
         return speed * ux, speed * uy, _climb(HOVER - height)
-    vx, vy = push(rod, goal, OUTSIDE)
+    vx, vy = push(rod, goal, turn, OUTSIDE)
     deep = 1 - ramp(height, TOP - 0.02, TOP + 0.04)
     return deep * vx, deep * vy, _climb(LOW - height)
 
 
-def push(rod: Point, goal: Goal, side: Side) -> Point:
+def push(rod: Point, goal: Point, turn: float, side: Side) -> Point:
     """Velocity of a rod at the height of the walls that pushes the box towards its goal."""
-    heading = min(range(4), key=lambda h: way(h, rod, goal, side))
+    heading = min(range(4), key=lambda h: way(h, rod, goal, turn, side))
     cosine, sine = _QUARTERS[heading]
     ahead, aside = _turned(*rod, cosine, -sine)
-    distance = math.hypot(*goal.place)
-    wanted = offset(heading, goal, side)
+    distance = math.hypot(*goal)
+    wanted = offset(heading, goal, turn, side)
     error = wanted - aside
     on = math.exp(-((error / OFFSET_WIDTH) ** 2))
     speed = PUSH_SPEED * max(SLOWEST, min(1.0, distance / SLOW_BEFORE))
@@ -189,52 +173,40 @@ def _round(ahead: float, aside: float, forward: float, sideways: float) -> Point
     )
 
 
-def way(heading: int, rod: Point, goal: Goal, side: Side) -> float:
+def way(heading: int, rod: Point, goal: Point, turn: float, side: Side) -> float:
     """Estimate of the way to the goal by pushing along `heading`, in metres."""
-    bearing, final, distance = _angles(heading, goal)
+    bearing, final, distance = _angles(heading, goal, turn)
     cosine, sine = _QUARTERS[heading]
     ahead, aside = _turned(*rod, cosine, -sine)
-    travel = math.hypot(ahead - side.contact, aside - offset(heading, goal, side))
-    turning = TURN * (bearing**2 + final**2)
-    return distance + turning + MOVE * travel + ROOM * _cramped(heading, goal)
+    travel = math.hypot(ahead - side.contact, aside - offset(heading, goal, turn, side))
+    return distance + TURN * (bearing**2 + final**2) + MOVE * travel
 
 
-def _cramped(heading: int, goal: Goal) -> float:
-    """Metres by which a way that sets out along `heading` swings out of the arm's reach."""
-    swing = SWING * math.hypot(*goal.place)
-    final = heading * math.pi / 2 + goal.turn
-    cosine, sine = _QUARTERS[heading]
-    out = swing * cosine, swing * sine
-    back = goal.place[0] - swing * math.cos(final), goal.place[1] - swing * math.sin(final)
-    reaches = (math.dist(out, goal.base), math.dist(back, goal.base))
-    return sum(max(0.0, REACH[0] - reach, reach - REACH[1]) for reach in reaches)
-
-
-def offset(heading: int, goal: Goal, side: Side) -> float:
+def offset(heading: int, goal: Point, turn: float, side: Side) -> float:
     """Where on the wall to push, aside of its middle."""
-    return _clip(-steer(heading, goal) * FOOT_RADIUS**2, side.reach)
+    return _clip(-steer(heading, goal, turn) * FOOT_RADIUS**2, side.reach)
 
 
-def steer(heading: int, goal: Goal) -> float:
+def steer(heading: int, goal: Point, turn: float) -> float:
     """Curvature in 1/m of the way to the goal (Park and Kuipers 2011, eq. 14)."""
-    bearing, final, distance = _angles(heading, goal)
+    bearing, final, distance = _angles(heading, goal, turn)
     distance = max(distance, NEAREST)
     wanted = math.atan(-BEND_BEARING * final)
     bend = 1 + BEND_BEARING / (1 + (BEND_BEARING * final) ** 2)
     return -(BEND_HEADING * (bearing - wanted) + bend * math.sin(bearing)) / distance
 
 
-def _angles(heading: int, goal: Goal) -> tuple[float, float, float]:
+def _angles(heading: int, goal: Point, turn: float) -> tuple[float, float, float]:
     """Present and final heading as seen from the line of sight to a point that lies BEYOND the
     goal, in +- pi, and the distance of that point."""
-    final = heading * math.pi / 2 + goal.turn
+    final = heading * math.pi / 2 + turn
     cosine, sine = math.cos(final), math.sin(final)
-    x, y = goal.place
-    slack = _clip(cosine * y - sine * x, SLACK)
-    x, y = x + BEYOND * cosine + slack * sine, y + BEYOND * sine - slack * cosine
+    aside = cosine * goal[1] - sine * goal[0]
+    slack = _clip(aside, SLACK)
+    x, y = goal[0] + BEYOND * cosine + slack * sine, goal[1] + BEYOND * sine - slack * cosine
     sight = math.atan2(y, x)
     now = heading * math.pi / 2 - sight
-    return _wrap(now), _wrap(now + goal.turn), math.hypot(x, y)
+    return _wrap(now), _wrap(now + turn), math.hypot(x, y)
 
 
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
