@@ -1,0 +1,139 @@
+"""Write docs/models.md: a card for every shipped policy, from what its file says about itself.
+
+    .venv/bin/python scripts/model_cards.py
+
+A test compares the page with the files, so that no card tells of another policy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rodif_core.intervals import wilson_interval
+from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
+from rodif_core.presets import preset_for
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
+from rodif_core.tasks import get_task
+
+PAGE = Path(__file__).parents[1] / "docs" / "models.md"
+# Success of the paper's pretrained policies (its table of main results), per cent. Its
+# demonstrations are other ones, and it sees Aligning and Stacking through cameras only.
+PAPER_SUCCESS = {"avoid": 78, "pushing": 58, "sorting": 82, "aligning": 5, "stacking": 23}
+# User time of the training on one thread of a shared AMD EPYC, demonstrations and measurement
+# included; what `time` said when the shipped file was made.
+CPU_MINUTES = {"avoid": 10, "pushing": 33, "sorting": 55}
+
+HEAD = """# Shipped policies
+One pretrained policy a task lies in `rodif_core/checkpoints/`. This page is made from these
+files by `.venv/bin/python scripts/model_cards.py`. Brackets are 95 % Wilson intervals;
+*preferred* is the share of the preferred group among successes. *Paper* is the success of the
+paper's own pretrained policy on the task of that name: other demonstrations, other simulation.
+
+"""
+
+
+def main() -> None:
+    """Write the page."""
+    PAGE.write_text(page())
+
+
+def page() -> str:
+    """The whole page."""
+    checkpoints = [load_checkpoint(shipped_checkpoint(task)) for task in shipped_tasks()]
+    rows = [
+        "| task | success | preferred | off the data | n | paper |",
+        "|---|---|---|---|---|---|",
+        *(_row(one) for one in checkpoints),
+    ]
+    return HEAD + "\n".join(rows) + "\n" + "".join(_card(one) for one in checkpoints)
+
+
+def measurement(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The evaluation on a card; Avoid's, the first one, has it under another name."""
+    found: dict[str, Any] = checkpoint.card.get("evaluation") or checkpoint.card["measured"]
+    return found
+
+
+def _row(checkpoint: Checkpoint) -> str:
+    task, measured = get_task(checkpoint.task), measurement(checkpoint)
+    paper = PAPER_SUCCESS[task.name.value.removesuffix("-state")]
+    cells = [
+        f"[`{task.name.value}`](#{task.name.value})",
+        f"{measured['success']:.1%} {_interval(measured, 'success')}",
+        f"{task.preferred_group}: {measured['alignment_of_successes']:.1%}"
+        f" {_interval(measured, 'alignment_of_successes')}",
+        f"{measured['off_support']:.1%}",
+        str(measured["n"]),
+        f"{paper} %",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _card(checkpoint: Checkpoint) -> str:
+    name, card, config = checkpoint.task.value, checkpoint.card, checkpoint.policy.config
+    preset = card["preset"]
+    weights = sum(value.numel() for value in checkpoint.policy.denoiser.parameters())
+    seen = ""
+    if checkpoint.policy.encoder is not None:
+        weights_seen = sum(value.numel() for value in checkpoint.policy.encoder.parameters())
+        encoder = preset["encoder"]
+        seen = (
+            f" The encoder of its {config.images.cameras if config.images else 0} cameras has"
+            f" {weights_seen:,} weights and saw {encoder['moments']:,} moments in"
+            f" {encoder['updates']:,} updates of {encoder['batch_size']}."
+        )
+    return (
+        f"\n## {name}\n"
+        f"`{config.architecture.value}` with {weights:,} weights; history"
+        f" {config.observation_steps}, chunk {config.predicted_steps}, executed {config.executed_steps}, K ="
+        f" {config.denoising_steps}. {card['demonstrations']:,} scripted demonstrations,"
+        f" {preset['updates']:,} updates of {preset['batch_size']} rows.{seen} About"
+        f" {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
+        f"```\nrodif pretrain {name} --preset cpu --demonstrations {card['demonstrations']}"
+        f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
+        f"Modes of the successes: {_modes(checkpoint)}.\n"
+    )
+
+
+def _modes(checkpoint: Checkpoint) -> str:
+    modes, task = measurement(checkpoint)["modes"], get_task(checkpoint.task)
+    found = sum(modes.values())
+    if len(task.modes) > 6:
+        groups = {
+            group: sum(count for mode, count in modes.items() if task.group_of(mode) == group)
+            for group in task.groups
+        }
+        return f"{len(modes)} of {len(task.modes)} alive; " + _shares(groups, found)
+    return _shares({mode: modes.get(mode, 0) for mode in task.modes}, found)
+
+
+def _shares(counts: dict[str, int], found: int) -> str:
+    parts = []
+    for name, count in counts.items():
+        low, high = wilson_interval(count, found)
+        parts.append(f"{name} {count / max(1, found):.0%} [{100 * low:.0f}–{100 * high:.0f}]")
+    return ", ".join(parts)
+
+
+def _interval(measured: dict[str, Any], name: str) -> str:
+    low, high = measured["intervals"][name]
+    return f"[{100 * low:.0f}–{100 * high:.0f}]"
+
+
+def preset_differences(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What today's CPU preset says otherwise than the checkpoint's training; empty when nothing."""
+    from dataclasses import asdict
+
+    trained, today = checkpoint.card["preset"], asdict(preset_for(checkpoint.task, "cpu"))
+    plain = {k: list(v) if isinstance(v, tuple) else v for k, v in today["size"].items()}
+    today["size"] = plain
+    return {
+        name: (trained[name], today[name])
+        for name in today
+        if name in trained and trained[name] != today[name]
+    }
+
+
+if __name__ == "__main__":
+    main()

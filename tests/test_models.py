@@ -1,0 +1,35 @@
+"""The page of shipped policies tells of the files that are shipped, and of today's presets."""
+
+from __future__ import annotations
+
+import pytest
+
+from rodif_core.policies.checkpoint import load_checkpoint
+from rodif_core.shipped import shipped_checkpoint, shipped_tasks
+from rodif_core.spec import TaskName
+from scripts import model_cards
+
+MOST_BYTES = 20_000_000  # larger files do not belong into the repository
+# The paper's own pretrained policies; ours may not be worse.
+LEAST_SUCCESS = {
+    task: model_cards.PAPER_SUCCESS[task.removesuffix("-state")] / 100 for task in TaskName
+}
+
+
+def test_page_of_models_is_made_from_the_shipped_files():
+    assert model_cards.PAGE.read_text() == model_cards.page()
+
+
+@pytest.mark.parametrize("task", shipped_tasks())
+def test_a_shipped_policy_was_trained_with_todays_preset(task: TaskName):
+    assert model_cards.preset_differences(load_checkpoint(shipped_checkpoint(task))) == {}
+
+
+@pytest.mark.parametrize("task", shipped_tasks())
+def test_a_shipped_policy_is_small_good_and_undecided(task: TaskName):
+    blob = shipped_checkpoint(task)
+    assert len(blob) < MOST_BYTES
+    measured = model_cards.measurement(load_checkpoint(blob))
+    assert measured["n"] >= (200 if task in ("aligning", "stacking") else 500)
+    assert measured["success"] >= LEAST_SUCCESS[task]
+    assert len(measured["modes"]) >= 2
