@@ -83,13 +83,18 @@ def _card(checkpoint: Checkpoint) -> str:
             f" {weights_seen:,} weights and saw {encoder['moments']:,} moments in"
             f" {encoder['updates']:,} updates of {encoder['batch_size']}."
         )
+    shape = (
+        f"history {config.observation_steps}, chunk {config.predicted_steps},"
+        f" executed {config.executed_steps}, K = {config.denoising_steps}"
+    )
+    data = (
+        f"{card['demonstrations']:,} scripted demonstrations,"
+        f" {preset['updates']:,} updates of {preset['batch_size']} rows"
+    )
     return (
         f"\n## {name}\n"
-        f"`{config.architecture.value}` with {weights:,} weights; history"
-        f" {config.observation_steps}, chunk {config.predicted_steps}, executed {config.executed_steps}, K ="
-        f" {config.denoising_steps}. {card['demonstrations']:,} scripted demonstrations,"
-        f" {preset['updates']:,} updates of {preset['batch_size']} rows.{seen} About"
-        f" {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
+        f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}.{seen}"
+        f" About {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
         f"```\nrodif pretrain {name} --preset cpu --demonstrations {card['demonstrations']}"
         f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
