@@ -111,9 +111,11 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             )
         training = bar.add_task(f"training {number}", total=config.updates)
 
-        def show(done: int, _: int, metrics: dict[str, float], row: TaskID = training) -> None:
-            losses = ", ".join(f"{name} {value:.4f}" for name, value in metrics.items())
-            bar.update(row, completed=done, description=f"training ({losses})")
+        def show(done: int, of: int, metrics: dict[str, float], row: TaskID = training) -> None:
+            shown = {name: value for name, value in metrics.items() if name != "update"}
+            losses = ", ".join(f"{name} {value:.4f}" for name, value in shown.items())
+            # The encoder of a task with cameras trains first, and has a length of its own.
+            bar.update(row, completed=done, total=of, description=f"training ({losses})")
 
         workspace = None
         if args.workspace is not None:
