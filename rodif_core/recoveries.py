@@ -83,7 +83,7 @@ def _take_over(
             rng=rng,
             context=context,
             takeover=int(rng.integers(1, int(LATEST * task.max_steps))),
-            rows=[rows[i]],
+            rows=[rows[i].copy()],
             observations=[observations[i]],
             qpos=[qpos[i]],
             paths=[paths[i]],

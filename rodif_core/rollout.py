@@ -97,7 +97,10 @@ def _rollout_batch(
     observations = env.reset(contexts)
     qpos, paths = env.qpos, env.paths
     rows = sight.rows(observations, qpos)
-    records = [_Recorder(observations[i], qpos[i], paths[i], rows[i]) for i in range(len(seeds))]
+    # `rows` is written to as the episodes go on; records keep copies.
+    records = [
+        _Recorder(observations[i], qpos[i], paths[i], rows[i].copy()) for i in range(len(seeds))
+    ]
     chunks = np.zeros((len(seeds), size.executed_steps, size.action_dim), dtype=np.float32)
     step = 0
     while not env.done.all():

@@ -71,9 +71,7 @@ def test_file_of_another_format_names_both_formats() -> None:
 def test_shipped_checkpoint_loads_and_tells_what_it_reaches(task: TaskName) -> None:
     checkpoint = load_checkpoint(shipped_checkpoint(task))
     assert checkpoint.task is task
-    measured = checkpoint.card["measured"]
-    assert measured["n"] >= 500
-    assert 0 < measured["success"] <= 1
+    assert checkpoint.card["kind"] == "pretrained"  # the rest of the card: tests/test_models.py
 
 
 @pytest.mark.parametrize("task", sorted(set(TaskName) - set(shipped_tasks())))

@@ -21,10 +21,11 @@ from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.evaluate import evaluate, thin_path
 from rodif_core.gate import judge
 from rodif_core.intervals import wilson_interval
+from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.rollout import rollout
-from rodif_core.spec import RolloutConfig
+from rodif_core.spec import Architecture, RolloutConfig
 from rodif_core.trajectory import Trajectory
-from tests.core.learning import tiny_checkpoint
+from tests.core.learning import tiny_checkpoint, tiny_policy
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,18 @@ def test_rollout_without_noise_follows_the_means_from_the_same_beginnings(
 def test_noise_scale_out_of_range_is_named() -> None:
     with pytest.raises(ValueOutOfRangeError, match=r"noise_scale.*1\.5.*\[0, 1\]"):
         rollout(tiny_checkpoint(), RolloutConfig(episodes=1), noise_scale=1.5)
+
+
+def test_histories_are_the_observations_before_each_decision() -> None:
+    blind = tiny_policy(architecture=Architecture.TRANSFORMER)
+    # A history that is longer than what is executed reaches back to the first observation.
+    config = replace(blind.config, observation_steps=5, executed_steps=2)
+    torch.manual_seed(0)
+    policy = DiffusionPolicy.build(config, blind.normaliser)
+    made = rollout(replace(tiny_checkpoint(), policy=policy), RolloutConfig(episodes=2, seed=3))
+    for episode in made:
+        steps = episode.decision_steps[:, None] + np.arange(-4, 1)
+        assert np.array_equal(episode.histories, episode.observations[steps.clip(min=0)])
 
 
 def test_recorded_actions_are_the_executed_part_of_the_chains(

@@ -48,6 +48,19 @@ TASK = AligningStateTask()
 BOX, TARGET = (0.5, -0.2), (0.5, 0.3)  # m
 
 
+def view_of(setpoints: NDArray[Any], ends: NDArray[Any], objects: NDArray[Any]) -> View:
+    """A view of simulations whose arm, which Aligning does not look at, is at rest."""
+    rows = len(ends)
+    return View(
+        setpoints=setpoints,
+        ends=ends,
+        rotations=np.tile(np.eye(3), (rows, 1, 1)),
+        joints=np.zeros((rows, 7)),
+        objects=objects,
+        objects_before=objects,
+    )
+
+
 def pose(place: tuple[float, float], yaw: float = 0.0, height: float = 0.0) -> list[float]:
     return [*place, height, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
@@ -150,7 +163,7 @@ def test_success_needs_place_and_yaw(
     box = pose((TARGET[0] + offset[0], TARGET[1] + offset[1]), 1.2 + turn, offset[2])
     objects = objects_of(box, pose(TARGET, 1.2))
     assert aligned(objects).tolist() == [reached]
-    assert TASK.finished(View(np.zeros((1, 3)), np.zeros((1, 3)), objects)).tolist() == [reached]
+    assert TASK.finished(view_of(np.zeros((1, 3)), np.zeros((1, 3)), objects)).tolist() == [reached]
 
 
 def test_a_tilted_box_is_not_aligned() -> None:
@@ -170,8 +183,8 @@ def test_thresholds_are_those_of_d3il() -> None:
     ids=["fallen", "toppled"],
 )
 def test_a_box_that_cannot_be_brought_back_has_left(box: list[float]) -> None:
-    here = View(np.zeros((1, 3)), np.zeros((1, 3)), objects_of(pose(BOX)))
-    gone = View(np.zeros((1, 3)), np.zeros((1, 3)), objects_of(box))
+    here = view_of(np.zeros((1, 3)), np.zeros((1, 3)), objects_of(pose(BOX)))
+    gone = view_of(np.zeros((1, 3)), np.zeros((1, 3)), objects_of(box))
     assert TASK.inside(here).tolist() == [True]
     assert TASK.inside(gone).tolist() == [False]
 
@@ -228,12 +241,12 @@ def test_the_reading_of_a_mode_does_not_depend_on_where_the_box_is(
 def test_observations_worked_by_hand() -> None:
     # The box looks along y; the target is straight ahead of it, turned by a quarter to its right.
     objects = objects_of(pose(BOX, math.pi / 2), pose(TARGET, 0.0))
-    view = View(np.array([[0.4, -0.3, 0.2]]), np.array([[0.47, -0.2, 0.1]]), objects)
+    view = view_of(np.array([[0.4, -0.3, 0.2]]), np.array([[0.47, -0.2, 0.1]]), objects)
     expected = [0.4, -0.3, 0.2, 0.47, -0.2, 0.1]
     expected += [*BOX, 1.0, 0.0, *TARGET, 0.0, 1.0]
     expected += [0.0, math.tanh(0.03 / 0.06), math.tanh(0.5 / 0.1), 0.0, -1.0, 0.0]
     assert np.allclose(TASK.observe(view), [expected], atol=1e-12)
-    assert np.isfinite(TASK.observe(View(view.setpoints, view.ends, objects[:, [0, 0]]))).all()
+    assert np.isfinite(TASK.observe(view_of(view.setpoints, view.ends, objects[:, [0, 0]]))).all()
 
 
 def test_box_frame_worked_by_hand() -> None:
@@ -312,13 +325,15 @@ def test_the_expert_is_equivariant_under_a_quarter_turn_of_the_scene(mode: str) 
         pose((0.5, -0.15), 0.3),
         pose(TARGET, 1.0),
     )
-    view = View(ends, ends, objects_of(boxes, targets))
+    view = view_of(ends, ends, objects_of(boxes, targets))
     turned_ends = np.array([[0.1, 0.45, 0.05]])  # (x, y) becomes (-y, x)
     turned = objects_of(
         pose((0.15, 0.5), 0.3 + math.pi / 2), pose((-TARGET[1], TARGET[0]), 1.0 + math.pi / 2)
     )
     first = expert.act(TASK.observe(view).astype(np.float32)[0])
-    second = expert.act(TASK.observe(View(turned_ends, turned_ends, turned)).astype(np.float32)[0])
+    second = expert.act(
+        TASK.observe(view_of(turned_ends, turned_ends, turned)).astype(np.float32)[0]
+    )
     assert np.allclose(second, [-first[1], first[0], first[2]], atol=1e-5)
 
 
