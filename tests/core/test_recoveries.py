@@ -15,8 +15,9 @@ from rodif_core.policies.unet import UnetSize
 from rodif_core.presets import PretrainConfig
 from rodif_core.pretrain import pretrain
 from rodif_core.recoveries import make_recoveries
+from rodif_core.rollout import rollout
 from rodif_core.shipped import shipped_checkpoint
-from rodif_core.spec import TaskName
+from rodif_core.spec import RolloutConfig, TaskName
 from rodif_core.tasks import get_task
 from rodif_core.tasks.experts.pushing import PushingExpert
 from rodif_core.trajectory import Trajectory
@@ -40,7 +41,7 @@ def test_a_recovery_begins_where_the_expert_took_over_and_succeeds() -> None:
     assert len(recovered()) >= 3
     for one in recovered():
         assert one.success and one.outcome["mode"] in task.modes
-        assert 1 <= one.info["taken_over_at"] < task.max_steps
+        assert 1 <= one.info["taken_over_at"] < recoveries.LATEST * task.max_steps
         assert one.info["taken_over_at"] + len(one.actions) <= task.max_steps
         assert one.info["checkpoint"] == beginner().digest
         assert len(one.decision_steps) == 0
@@ -53,11 +54,26 @@ def test_the_actions_of_a_recovery_are_the_experts() -> None:
             np.testing.assert_allclose(done, expert.act(seen), atol=1e-6)
 
 
-def test_a_recovery_depends_on_its_seed_and_index_alone() -> None:
+def test_a_recovery_depends_on_its_seed_alone() -> None:
     again = make_recoveries(beginner(), episodes=6, seed=5)
     assert [one.to_bytes() for one in again] == [one.to_bytes() for one in recovered()]
-    other = make_recoveries(beginner(), episodes=2, seed=6)
-    assert other[0].context != recovered()[0].context
+    other = make_recoveries(beginner(), episodes=4, seed=7)
+    contexts = {one.info["seed"]: one.context for one in recovered()}
+    shared = [one for one in other if one.info["seed"] in contexts]
+    assert shared and len(contexts) == len(recovered())
+    assert [one.context for one in shared] == [contexts[one.info["seed"]] for one in shared]
+
+
+def test_a_recovery_goes_on_from_where_the_policy_had_driven() -> None:
+    """Takeovers are drawn from the steps that the policy lasted, so none comes after its end."""
+    driven = rollout(beginner(), RolloutConfig(episodes=6, seed=5))
+    for one in recovered():
+        drive = driven[one.info["seed"] - 5]
+        step = one.info["taken_over_at"]
+        assert one.context == drive.context and step < len(drive.actions)
+        np.testing.assert_array_equal(one.observations[0], drive.observations[step])
+        np.testing.assert_array_equal(one.qpos[0], drive.qpos[step])
+        np.testing.assert_array_equal(one.paths[0], drive.paths[step])
 
 
 def test_the_expert_goes_on_in_the_mode_that_the_policy_was_after() -> None:
@@ -81,5 +97,5 @@ def test_values_out_of_range_are_refused(values: dict[str, int], message: str) -
 def test_recoveries_do_not_depend_on_how_many_run_together(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recoveries, "PARALLEL", 2)
     again = make_recoveries(beginner(), episodes=3, seed=5)
-    both = [one for one in recovered() if one.info["index"] < 3]
+    both = [one for one in recovered() if one.info["seed"] < 5 + 3]
     assert [one.context for one in again] == [one.context for one in both]

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.presets import PretrainConfig
 
-RECOVERY_SEEDS = 500_000_000  # first seed of takeovers
+# Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
+RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
+ROUND_SEEDS = 1_000_000  # … how far the seeds of its rounds are apart
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
 
 
@@ -105,10 +107,8 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     checkpoint = None
     for number in range(args.rounds + 1):
         if checkpoint is not None:
-            # Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
-            shown += make_recoveries(
-                checkpoint, episodes=args.recoveries, seed=RECOVERY_SEEDS + args.seed + number
-            )
+            first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
+            shown += make_recoveries(checkpoint, episodes=args.recoveries, seed=first_seed)
         training = bar.add_task(f"training {number}", total=config.updates)
 
         def show(done: int, of: int, metrics: dict[str, float], row: TaskID = training) -> None:
