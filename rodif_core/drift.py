@@ -20,6 +20,7 @@ from rodif_core.trajectory import Trajectory
 PERCENTILE = 0.99
 VOXEL = 0.03  # edge of the thinning grid, normalised units: well below the threshold it yields
 MAX_POINTS = 8192  # kept at most: in 20 dimensions a voxel holds one state, and thins nothing
+SLACK = 0.9999  # of squared lengths: far more than single precision rounds away
 _CHUNK = 2048  # rows of the distance matrix held at once
 
 
@@ -54,12 +55,20 @@ def spread_out(points: Tensor, count: int) -> Tensor:
     those taken so far (Gonzalez 1985: at most twice the covering radius of the best choice)."""
     if len(points) <= count:
         return points.contiguous()
-    taken = torch.zeros(count, dtype=torch.int64)
-    distances = torch.full((len(points),), torch.inf)
+    taken = torch.zeros(count, dtype=torch.int64)  # the first is row 0
+    distances = (points - points[0]).square().sum(1)  # squared, to the nearest of those taken
+    nearest = torch.zeros(len(points), dtype=torch.int64)  # which of those that is
     for index in range(1, count):
-        offsets = points - points[taken[index - 1]]
-        torch.minimum(distances, (offsets * offsets).sum(1), out=distances)
         taken[index] = distances.argmax()
+        newest = points[taken[index]]
+        # By the triangle inequality a point that is nearer to its own than half the way from there
+        # to the newest is farther from the newest, and need not be looked at.
+        ways = (points[taken[:index]] - newest).square().sum(1)
+        rows = torch.nonzero(SLACK * ways[nearest] < 4 * distances).squeeze(1)
+        fresh = (points[rows] - newest).square().sum(1)
+        closer = fresh < distances[rows]
+        distances[rows[closer]] = fresh[closer]
+        nearest[rows[closer]] = index
     return points[taken.sort().values].contiguous()
 
 

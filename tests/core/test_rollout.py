@@ -146,6 +146,20 @@ def test_spreading_out_keeps_the_far_points_and_their_order() -> None:
     assert spread_out(points, 12).tolist() == points.tolist()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_spreading_out_takes_the_farthest_point_each_time(seed: int) -> None:
+    """Beside the plain loop that looks at every point every time; some points are there twice."""
+    generator = torch.Generator().manual_seed(seed)
+    clusters = torch.randint(8, (300, 1), generator=generator) * torch.ones(3)
+    points = clusters + 0.1 * torch.randn(300, 3, generator=generator)
+    points[200:250] = points[:50]
+    taken = [0]
+    for _ in range(59):
+        nearest = (points[:, None] - points[taken]).square().sum(2).amin(1)
+        taken.append(int(nearest.argmax()))
+    assert spread_out(points, 60).tolist() == points[sorted(taken)].tolist()
+
+
 def test_support_in_many_dimensions_stays_small() -> None:
     generator = torch.Generator().manual_seed(0)
     known = torch.rand(MAX_POINTS + 500, 12, generator=generator)
