@@ -28,7 +28,14 @@ from rodif_core.policies.resnet import ImageConfig, ImageEncoder
 from rodif_core.sight import Sight, draw
 from rodif_core.tasks.base import Task
 from rodif_core.tasks.camera import Camera
-from rodif_core.training_state import Progress, cosine_rate, load_state, save_state
+from rodif_core.training_state import (
+    Precision,
+    Progress,
+    cosine_rate,
+    forward_precision,
+    load_state,
+    save_state,
+)
 from rodif_core.trajectory import Trajectory
 
 SAVE_EVERY = 250  # updates between partial states
@@ -119,6 +126,7 @@ def train_encoder(
     seed: int,
     workspace: Path | None = None,
     device: str = "cpu",
+    precision: Precision = Precision.FLOAT32,
     progress: Progress | None = None,
 ) -> tuple[ImageEncoder, list[dict[str, float]]]:
     """A trained encoder and its curve; goes on from `workspace` when a partial state is there.
@@ -143,7 +151,8 @@ def train_encoder(
         for group in optimizer.param_groups:
             group["lr"] = config.learning_rate * cosine_rate(update, config.warm_up, config.updates)
         pick = torch.randint(len(seen.felt), (config.batch_size,), generator=generator)
-        loss = model.error(*seen.pick(pick, device))
+        with forward_precision(device, precision):
+            loss = model.error(*seen.pick(pick, device))
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

@@ -28,7 +28,16 @@ from rodif_core.policies.resnet import ImageEncoder
 from rodif_core.presets import PretrainConfig
 from rodif_core.spec import TaskName
 from rodif_core.tasks import get_task
-from rodif_core.training_state import Progress, cosine_rate, load_state, save_state
+from rodif_core.training_state import (
+    Precision,
+    Progress,
+    check_device,
+    cosine_rate,
+    forward_precision,
+    load_state,
+    save_state,
+    usual_precision,
+)
 from rodif_core.trajectory import Trajectory
 
 SAVE_EVERY = 500  # updates between partial states
@@ -69,15 +78,19 @@ def pretrain(
     start: Checkpoint | None = None,
     workspace: Path | None = None,
     device: str = "cpu",
+    precision: Precision | None = None,
     progress: Progress | None = None,
 ) -> Checkpoint:
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
 
-    start  go on from this policy, with its size and normaliser, instead of from fresh weights
+    start      go on from this policy, with its size and normaliser, instead of from fresh weights
+    precision  of the forward passes; by default mixed on a GPU
 
     The result holds the averaged weights, the normaliser and the support set. Raises
-    LearningError when the loss is not finite.
+    LearningError when the loss is not finite and UnknownNameError for a device that is not there.
     """
+    check_device(device)
+    precision = precision or usual_precision(device)
     task = get_task(task_name)
     held_out_count = max(1, int(len(demonstrations) * config.held_out))
     order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
@@ -87,7 +100,8 @@ def pretrain(
     if config.images is not None and encoder is None:
         encoder, encoder_curve = train_encoder(
             task, known, held_out, config.images, config.encoder,
-            seed=config.seed, workspace=workspace, device=device, progress=progress,
+            seed=config.seed, workspace=workspace, device=device, precision=precision,
+            progress=progress,
         )  # fmt: skip
     shape = config.policy_config(task) if start is None else start.policy.config
     seen = encode(task, shape, encoder, known)
@@ -99,6 +113,7 @@ def pretrain(
         config,
         workspace,
         device,
+        precision,
         progress,
     )
     trained = replace(policy, denoiser=average)
@@ -106,6 +121,8 @@ def pretrain(
         "kind": "pretrained",
         "architecture": shape.architecture.value,
         "preset": asdict(config),
+        "device": device,
+        "precision": precision.value,
         "start": None if start is None else start.digest,
         "demonstrations": len(demonstrations),
         "held_out_curve": curve,
@@ -145,6 +162,7 @@ def _train(
     config: PretrainConfig,
     workspace: Path | None,
     device: str,
+    precision: Precision,
     progress: Progress | None,
 ) -> tuple[Any, list[dict[str, float]]]:
     model = policy.denoiser.to(device)
@@ -163,7 +181,8 @@ def _train(
         for group in optimizer.param_groups:
             group["lr"] = config.learning_rate * cosine_rate(update, config.warm_up, config.updates)
         pick = torch.randint(len(chunks), (config.batch_size,), generator=generator).to(device)
-        loss = _noise_loss(policy, model, histories[pick], chunks[pick], generator)
+        with forward_precision(device, precision):
+            loss = _noise_loss(policy, model, histories[pick], chunks[pick], generator)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

@@ -1,4 +1,4 @@
-"""What training loops share: the rate, and partial state on disk, so that a killed run goes on.
+"""What training loops share: rate, precision, and partial state on disk for a killed run to go on.
 
 One safetensors file (parameters, averages, Adam moments) with a JSON header; written to a
 temporary file and renamed, so a kill in the middle leaves the older state.
@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,36 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
+from rodif_core.errors import UnknownNameError
+
 Progress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
+
+
+class Precision(StrEnum):
+    """In which numbers a forward pass is computed; weights and updates are always float32."""
+
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"  # mixed precision: the range of float32, half the memory traffic
+
+
+def usual_precision(device: str) -> Precision:
+    """Mixed where it is fast, on a GPU."""
+    return Precision.FLOAT32 if device == "cpu" else Precision.BFLOAT16
+
+
+def check_device(device: str) -> None:
+    """Raises UnknownNameError for a device that this machine has not."""
+    legal = ["cpu"]
+    if torch.cuda.is_available():
+        legal += ["cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    if device not in legal:
+        raise UnknownNameError("device", device, legal)
+
+
+def forward_precision(device: str, precision: Precision) -> torch.autocast:
+    """The context of a forward pass and its loss."""
+    kind = torch.device(device).type
+    return torch.autocast(kind, torch.bfloat16, enabled=precision is Precision.BFLOAT16)
 
 
 def cosine_rate(update: int, warm_up: int, updates: int) -> float:

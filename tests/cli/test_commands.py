@@ -14,9 +14,12 @@ from PIL import Image
 from labeling_ui.mode_plot import GROUP_COLOURS
 from rodif_core.demonstrations import load_demonstrations
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
+from rodif_core.presets import PRESETS
 from rodif_core.shipped import shipped_tasks
 from rodif_core.spec import TaskName
+from rodif_core.training_state import Precision
 from tests.core.learning import tiny_checkpoint
+from worker.cli import pretrain
 from worker.cli.main import main
 from worker.cli.options import number_list
 
@@ -164,3 +167,9 @@ def test_number_list_takes_numbers_and_ranges():
 def test_number_list_refuses_anything_else(text: str):
     with pytest.raises(argparse.ArgumentTypeError):
         number_list(text)
+
+
+def test_pretrain_offers_the_presets_and_precisions_that_there_are() -> None:
+    """The help does not load torch, so it has copies of these names."""
+    assert all(set(pretrain.PRESET_NAMES) == set(presets) for presets in PRESETS.values())
+    assert pretrain.PRECISIONS == tuple(precision.value for precision in Precision)

@@ -19,6 +19,7 @@ from rodif_core.presets import PRESETS, TASK_ARCHITECTURES, PretrainConfig, pres
 from rodif_core.pretrain import Windows, pretrain
 from rodif_core.spec import Architecture, TaskName
 from rodif_core.tasks import get_task
+from rodif_core.training_state import Precision, usual_precision
 from rodif_core.trajectory import Trajectory
 from tests.core.learning import TINY_SIZES
 
@@ -132,6 +133,28 @@ def test_every_task_has_an_architecture_and_avoid_keeps_its_training() -> None:
     assert (config.weight_decay, config.warm_up, config.ema_decay) == (1e-6, 200, 0.999)
     with pytest.raises(UnknownNameError, match="unknown preset 'gpu'.*'cpu', 'paper'"):
         preset_for(TaskName.AVOID, "gpu")
+
+
+def test_mixed_precision_computes_in_half_and_keeps_full_weights(
+    demonstrations: list[Trajectory],
+) -> None:
+    full = pretrain(TaskName.AVOID, demonstrations, CONFIG)
+    mixed = pretrain(TaskName.AVOID, demonstrations, CONFIG, precision=Precision.BFLOAT16)
+    assert full.card["precision"] == "float32" and mixed.card["precision"] == "bfloat16"
+    assert all(weight.dtype == torch.float32 for weight in mixed.policy.denoiser.parameters())
+    assert mixed.digest != full.digest
+    ends = [one.card["held_out_curve"][-1]["held_out"] for one in (full, mixed)]
+    assert ends[1] == pytest.approx(ends[0], rel=0.05)  # bfloat16 has 8 bits of fraction
+
+
+def test_mixed_precision_is_usual_on_a_gpu_only() -> None:
+    assert usual_precision("cpu") is Precision.FLOAT32
+    assert usual_precision("cuda:0") is Precision.BFLOAT16
+
+
+def test_a_device_that_is_not_there_is_refused(demonstrations: list[Trajectory]) -> None:
+    with pytest.raises(UnknownNameError, match="unknown device 'tpu'.*'cpu'"):
+        pretrain(TaskName.AVOID, demonstrations, CONFIG, device="tpu")
 
 
 def test_killed_pretraining_goes_on_to_the_same_weights(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
 ROUND_SEEDS = 1_000_000  # … how far the seeds of its rounds are apart
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
+PRECISIONS = ("float32", "bfloat16")  # of rodif_core.training_state
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -52,6 +53,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        help="of the forward passes; bfloat16 is mixed precision (default: that on a GPU)",
+    )
     parser.add_argument(
         "--workspace", type=Path, help="keeps partial state; a broken run goes on from there"
     )
@@ -95,7 +101,9 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     from rodif_core.pretrain import pretrain
     from rodif_core.recoveries import make_recoveries
     from rodif_core.tasks import get_task
+    from rodif_core.training_state import Precision, check_device
 
+    check_device(args.device)
     making = bar.add_task("demonstrations", total=args.demonstrations)
     shown = make_demonstrations(
         get_task(args.task),
@@ -128,6 +136,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             start=checkpoint,
             workspace=workspace,
             device=args.device,
+            precision=Precision(args.precision) if args.precision else None,
             progress=show,
         )
     assert checkpoint is not None
