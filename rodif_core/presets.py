@@ -37,6 +37,9 @@ class PretrainConfig:
     weight_decay: float = 1e-6
     warm_up: int = 200
     ema_decay: float = 0.999
+    rounds: int = 0  # of training again, on what experts did after they took over
+    recoveries: int = 300  # takeovers tried a round
+    round_updates: int = 8_000
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
     encoder: EncoderConfig = EncoderConfig()  # how their encoder is trained
@@ -45,8 +48,10 @@ class PretrainConfig:
     def __post_init__(self) -> None:
         if not 0 < self.held_out < 0.5:
             raise ValueOutOfRangeError("held_out", self.held_out, "in (0, 0.5)")
-        if self.updates < 1:
-            raise ValueOutOfRangeError("updates", self.updates, "at least 1")
+        least = {"updates": 1, "round_updates": 1, "recoveries": 1, "rounds": 0}
+        for name, value in least.items():
+            if getattr(self, name) < value:
+                raise ValueOutOfRangeError(name, getattr(self, name), f"at least {value}")
 
     def policy_config(self, task: Task) -> PolicyConfig:
         """The policy's shape for a task.
@@ -171,7 +176,7 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
 
 
 def preset_for(task: TaskName, name: str) -> PretrainConfig:
-    """How a task's policy is pretrained in that preset; raises UnknownNameError listing the legal names."""
+    """How a task's policy is pretrained; raises UnknownNameError listing the legal presets."""
     presets = PRESETS[TASK_ARCHITECTURES[task]]
     if name not in presets:
         raise UnknownNameError("preset", name, presets)

@@ -83,7 +83,8 @@ def pretrain(
 ) -> Checkpoint:
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
 
-    start      go on from this policy, with its size and normaliser, instead of from fresh weights
+    start      go on from this policy, with its size and normaliser, for `config.round_updates`,
+               instead of from fresh weights for `config.updates`
     precision  of the forward passes; by default mixed on a GPU
 
     The result holds the averaged weights, the normaliser and the support set. Raises
@@ -110,7 +111,7 @@ def pretrain(
         policy,
         Windows.cut(seen, shape, policy.normaliser),
         Windows.cut(encode(task, shape, encoder, held_out), shape, policy.normaliser),
-        config,
+        config if start is None else replace(config, updates=config.round_updates),
         workspace,
         device,
         precision,

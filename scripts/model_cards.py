@@ -87,15 +87,21 @@ def _card(checkpoint: Checkpoint) -> str:
         f"history {config.observation_steps}, chunk {config.predicted_steps},"
         f" executed {config.executed_steps}, K = {config.denoising_steps}"
     )
+    shown = card["demonstrations"] - card.get("recoveries", 0)
     data = (
-        f"{card['demonstrations']:,} scripted demonstrations,"
+        f"{shown:,} scripted demonstrations,"
         f" {preset['updates']:,} updates of {preset['batch_size']} rows"
     )
+    if card.get("rounds"):
+        data += (
+            f"; then {card['rounds']} rounds of {preset['round_updates']:,} updates, each on what"
+            f" experts did after takeovers too ({card['recoveries']} in all)"
+        )
     return (
         f"\n## {name}\n"
         f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}.{seen}"
         f" About {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
-        f"```\nrodif pretrain {name} --preset cpu --demonstrations {card['demonstrations']}"
+        f"```\nrodif pretrain {name} --preset cpu --demonstrations {shown}"
         f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
     )

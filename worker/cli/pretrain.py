@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
 ROUND_SEEDS = 1_000_000  # … how far the seeds of its rounds are apart
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
+# Fields of a preset that an argument changes.
+OF_PRESETS = ("updates", "executed_steps", "rounds", "recoveries", "round_updates")
 PRECISIONS = ("float32", "bfloat16")  # of rodif_core.training_state
 
 
@@ -44,13 +46,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--rounds",
         type=int,
-        default=0,
         help="after the first training, let the expert take over from the policy, and train on"
-        " that too, so many times (default %(default)s)",
+        " that too, so many times (default: the preset's)",
     )
     parser.add_argument(
-        "--recoveries", type=int, default=300, help="takeovers tried a round (default %(default)s)"
+        "--recoveries", type=int, help="takeovers tried a round (default: the preset's)"
     )
+    parser.add_argument("--round-updates", type=int, help="of a round (default: the preset's)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default %(default)s)")
     parser.add_argument(
@@ -68,9 +70,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Demonstrate, train, let the expert take over and train again, measure, write."""
-    for name, least in (("evaluate", 0), ("rounds", 0), ("recoveries", 1)):
-        if getattr(args, name) < least:
-            raise ValueOutOfRangeError(name, getattr(args, name), f"at least {least}")
+    if args.evaluate < 0:
+        raise ValueOutOfRangeError("evaluate", args.evaluate, "at least 0")
 
     from rich.console import Console
     from rich.progress import Progress
@@ -79,11 +80,9 @@ def run(args: argparse.Namespace) -> int:
     from rodif_core.presets import preset_for
 
     task_name = TaskName(args.task)
-    config = replace(preset_for(task_name, args.preset), seed=args.seed)
-    if args.updates is not None:
-        config = replace(config, updates=args.updates)
-    if args.executed_steps is not None:
-        config = replace(config, executed_steps=args.executed_steps)
+    wishes = {name: getattr(args, name) for name in OF_PRESETS}
+    given = {name: value for name, value in wishes.items() if value is not None}
+    config = replace(preset_for(task_name, args.preset), seed=args.seed, **given)
     console = Console(stderr=True)
     with Progress(console=console) as bar:
         checkpoint = _train(args, config, bar)
@@ -96,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> Checkpoint:
-    """The first training and `args.rounds` more, each on all that experts have shown so far."""
+    """The first training and the rounds after it, each on all that experts have shown so far."""
     from rodif_core.demonstrations import make_demonstrations
     from rodif_core.pretrain import pretrain
     from rodif_core.recoveries import make_recoveries
@@ -113,10 +112,10 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         progress=lambda done, _: bar.update(making, completed=done),
     )
     checkpoint = None
-    for number in range(args.rounds + 1):
+    for number in range(config.rounds + 1):
         if checkpoint is not None:
             first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
-            shown += make_recoveries(checkpoint, episodes=args.recoveries, seed=first_seed)
+            shown += make_recoveries(checkpoint, episodes=config.recoveries, seed=first_seed)
         training = bar.add_task(f"training {number}", total=config.updates)
 
         def show(done: int, of: int, metrics: dict[str, float], row: TaskID = training) -> None:
@@ -140,7 +139,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             progress=show,
         )
     assert checkpoint is not None
-    facts = {"rounds": args.rounds, "recoveries": len(shown) - args.demonstrations}
+    facts = {"rounds": config.rounds, "recoveries": len(shown) - args.demonstrations}
     return replace(checkpoint, card=checkpoint.card | facts)
 
 
