@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         check_film_path(args.video)
         # Told now and not after the rollouts.
         with Camera(get_task(args.task), 32, 24) as camera:
-            _ = camera.graphics
+            camera.start()
     checkpoint = _checkpoint(TaskName(args.task), args.checkpoint)
     progress = Console(stderr=True)
     episodes = _rolled_out(checkpoint, config, args.processes, progress)
