@@ -135,6 +135,15 @@ def test_an_episode_that_does_not_hold_together_is_refused(
         read_episode(TaskName.AVOID, write_record(tmp_path / "x.pkl", record))
 
 
+def test_a_gripper_that_was_recorded_for_fewer_rows_than_the_joints_is_refused(tmp_path: Path):
+    robot = {"des_c_pos": np.zeros((3, 3)), "des_j_pos": np.zeros((3, 7))}
+    robot["gripper_width"] = np.zeros(2)
+    pose = {"pos": np.zeros((3, 3)), "quat": np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))}
+    record = {"robot": robot} | dict.fromkeys(FORMATS[TaskName.STACKING].places.values(), pose)
+    with pytest.raises(DemonstrationFileError, match="has 2 rows, but must have 3, as 'des_j_pos"):
+        read_episode(TaskName.STACKING, write_record(tmp_path / "x.pkl", record))
+
+
 def test_a_file_of_another_task_is_refused(shown: list[Trajectory], tmp_path: Path):
     file = write_record(tmp_path / "x.pkl", d3il_record(get_task("avoid"), shown[0]))
     with pytest.raises(DemonstrationFileError, match="no array 'pos' of 'red-box'; it is no epis"):
