@@ -88,6 +88,7 @@ def options_of(parser: argparse.ArgumentParser) -> set[str]:
 
 
 COMMANDS = subcommands(build_parser())
+assert COMMANDS, "rodif has no commands"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

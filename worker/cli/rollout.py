@@ -12,6 +12,8 @@ from rodif_core.spec import RolloutConfig, TaskName
 from worker.cli.evaluate import read_checkpoint
 from worker.cli.options import add_json_argument, give_json
 
+MAP_DATA = ("paths", "path_groups")  # of an evaluation, for the site's maps; the film shows more
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -81,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         save_demonstrations(args.out, episodes)
     if args.video is not None:
         _film(args, report, episodes, progress)
-    kept = {name: value for name, value in report.items() if not name.startswith("path")}
+    kept = {name: value for name, value in report.items() if name not in MAP_DATA}
     if not give_json(kept, args.json):
         _print(kept, [path for path in (args.out, args.video) if path is not None])
     return 0
