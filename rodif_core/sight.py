@@ -55,8 +55,9 @@ class Sight:
 
         Raises GraphicsError when pictures are needed and this machine cannot draw.
         """
-        if self._camera is None or self._encoder is None:
+        if self._camera is None:
             return observations.copy()
+        assert self._encoder is not None  # a policy with images has one
         felt = torch.tensor(observations[:, : self._task.proprioception_dim])
         parts = []
         for first in range(0, len(qpos), ENCODED_TOGETHER):
