@@ -104,7 +104,7 @@ def test_wishes_that_cannot_be_met_are_refused(
 def test_without_gl_the_film_is_refused_before_anything_is_rolled_out(
     tiny: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("worker.cli.rollout._rolled_out", lambda *_: pytest.fail("rolled out"))
+    monkeypatch.setattr("worker.cli.rollout.rolled_out", lambda *_: pytest.fail("rolled out"))
     monkeypatch.setenv("MUJOCO_GL", "none")
     wish = ["--video", "film.mp4"]
     assert main(["rollout", "avoid", "--checkpoint", tiny, *wish]) == 1
