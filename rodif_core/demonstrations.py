@@ -163,29 +163,53 @@ class Recording:
 
         infos  where each comes from; the task's facts are added
         """
-        task = self._env.task
-        observations, actions, qpos, paths = (
+        columns = [
             np.stack(rows) for rows in (self._observations, self._actions, self._qpos, self._paths)
-        )
+        ]
         ends = zip(self._contexts, self._env.outcomes(), self._env.steps, infos, strict=True)
         return [
-            episode_without_decisions(
-                observations=observations[: steps + 1, i].copy(),
-                actions=actions[:steps, i].copy(),
-                qpos=qpos[: steps + 1, i].copy(),
-                paths=paths[: steps + 1, i].copy(),
+            recorded_episode(
+                self._env.task,
+                columns=[column[:, i] for column in columns],
+                length=int(steps),
                 context=context,
                 outcome=outcome,
-                info={
-                    "task": task.name.value,
-                    "mode": outcome["mode"],
-                    "control_dt": task.control_dt,
-                    "mujoco_version": mujoco.__version__,
-                    **info,
-                },
+                info=info,
             )
             for i, (context, outcome, steps, info) in enumerate(ends)
         ]
+
+
+def recorded_episode(
+    task: Task,
+    columns: Sequence[NDArray[np.float32]],
+    length: int,
+    context: dict[str, Any],
+    outcome: dict[str, Any],
+    info: dict[str, Any],
+) -> Trajectory:
+    """One episode without decisions, cut out of what many steps recorded.
+
+    columns  observations, actions, qpos, paths, each with a row a control step
+    length   control steps of this episode
+    info     where it comes from; the task's facts are added
+    """
+    observations, actions, qpos, paths = columns
+    return episode_without_decisions(
+        observations=observations[: length + 1].copy(),
+        actions=actions[:length].copy(),
+        qpos=qpos[: length + 1].copy(),
+        paths=paths[: length + 1].copy(),
+        context=context,
+        outcome=outcome,
+        info={
+            "task": task.name.value,
+            "mode": outcome["mode"],
+            "control_dt": task.control_dt,
+            "mujoco_version": mujoco.__version__,
+            **info,
+        },
+    )
 
 
 def save_demonstrations(path: Path, demonstrations: Sequence[Trajectory]) -> None:
