@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from labeling_ui.mode_plot import FAILED, FAILED_COLOUR, GROUP_COLOURS
+from labeling_ui.mode_plot import colours_of_groups, kind_of
 from rodif_core.tasks.base import FINISHED, Task
 from rodif_core.tasks.camera import Camera, Trail
 from rodif_core.tasks.panda import Mesh
@@ -122,18 +122,6 @@ class Mosaic:
 def columns_of(tiles: int) -> int:
     """Columns of a grid of 1 … MOST_TILES tiles."""
     return next(columns for most, columns in ((1, 1), (4, 2), (9, 3), (12, 4)) if tiles <= most)
-
-
-def kind_of(trajectory: Trajectory) -> str:
-    """The group of a success, FAILED for any other episode."""
-    return str(trajectory.outcome["group"]) if trajectory.success else FAILED
-
-
-def colours_of_groups(task: Task) -> dict[str, tuple[int, int, int]]:
-    """The colour of each group, the preferred one first, and of failures: as in mode plots."""
-    names = [task.preferred_group, *(g for g in task.groups if g != task.preferred_group)]
-    many = GROUP_COLOURS * (1 + len(names) // len(GROUP_COLOURS))
-    return dict(zip(names, many, strict=False)) | {FAILED: FAILED_COLOUR}
 
 
 def free_camera() -> mujoco.MjvCamera:

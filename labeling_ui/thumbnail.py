@@ -81,8 +81,9 @@ class _Panel:
         large = self._still.copy()
         draw = ImageDraw.Draw(large)
         poses = self._objects[min(end, len(self._objects)) - 1]
-        # From the lowest to the highest, as seen from above.
-        for cube in sorted(self._cubes, key=lambda cube: float(poses[cube["object"], 2])):
+        # From the lowest to the highest, as seen from above; within a centimetre as the scene lists
+        # them, or the jitter of what rests on the table would decide.
+        for cube in sorted(self._cubes, key=lambda cube: round(float(poses[cube["object"], 2]), 2)):
             halves = (cube["half_x"], cube["half_y"], cube["half_z"])
             corners = self._place.corners(poses[cube["object"]], halves)
             draw.polygon(corners, fill=cube["colour"], outline=INK, width=DETAIL)

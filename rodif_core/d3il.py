@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rodif_core.demonstrations import recorded_episode
+from rodif_core.demonstrations import Recording
 from rodif_core.errors import DemonstrationFileError, ValueOutOfRangeError
 from rodif_core.plain_pickle import StoredArray, read_plain_pickle
 from rodif_core.spec import TaskName
@@ -94,24 +94,27 @@ def _joints(record: _Record) -> Array:
     joints = record.rows("robot", "des_j_pos", len(JOINT_OFFSETS)) + JOINT_OFFSETS
     width = record.rows("robot", "gripper_width", 1)
     if len(width) != len(joints):
-        raise DemonstrationFileError(f"{record.name}: joints and gripper differ in rows")
+        raise DemonstrationFileError(
+            f"{record.name}: 'gripper_width' of 'robot' has {len(width)} rows, but must have"
+            f" {len(joints)}, as 'des_j_pos' has"
+        )
     return np.concatenate([joints, np.where(width > OPEN_ABOVE, MAX_OPENING, 0.0)], axis=1)
 
 
 @dataclass(frozen=True)
-class _Format:
+class Format:
     """Which of a file's objects are which of the context's places, and its set-points."""
 
     places: Mapping[str, str]
     setpoints: Callable[[_Record], Array]
 
 
-_ALIGNING = _Format({"box": "push-box", "target": "target-box"}, _spatial)
-_STACKING = _Format({"red": "red-box", "green": "green-box", "blue": "blue-box"}, _joints)
-FORMATS: dict[TaskName, _Format] = {
-    TaskName.AVOID: _Format({}, _planar),
-    TaskName.PUSHING: _Format({"red": "red-box", "green": "green-box"}, _planar),
-    TaskName.SORTING: _Format({"red": "red-box1", "blue": "blue-box1"}, _planar),
+_ALIGNING = Format({"box": "push-box", "target": "target-box"}, _spatial)
+_STACKING = Format({"red": "red-box", "green": "green-box", "blue": "blue-box"}, _joints)
+FORMATS: dict[TaskName, Format] = {
+    TaskName.AVOID: Format({}, _planar),
+    TaskName.PUSHING: Format({"red": "red-box", "green": "green-box"}, _planar),
+    TaskName.SORTING: Format({"red": "red-box1", "blue": "blue-box1"}, _planar),
     TaskName.ALIGNING: _ALIGNING,
     TaskName.STACKING: _STACKING,
     TaskName.ALIGNING_STATE: _ALIGNING,
@@ -186,8 +189,7 @@ def replay(
 def _replay_batch(task: Task, batch: Sequence[D3ilEpisode]) -> list[Trajectory]:
     """One trajectory an episode, successful or not."""
     env = BatchEnv(task, len(batch))
-    observations = [env.reset([episode.context for episode in batch])]
-    qpos, paths, actions = [env.qpos], [env.paths], []
+    recording = Recording(env, [episode.context for episode in batch])
     last = np.array([len(episode.setpoints) - 1 for episode in batch])
     row = 0
     while not env.done.all():
@@ -196,20 +198,7 @@ def _replay_batch(task: Task, batch: Sequence[D3ilEpisode]) -> list[Trajectory]:
         rows = np.minimum(row, last)
         wanted = np.stack([one.setpoints[i] for one, i in zip(batch, rows, strict=True)])
         moves = wanted - env.setpoints[:, : task.action_dim]
-        actions.append(task.clip(moves.astype(np.float32)))
-        observations.append(env.step(actions[-1]))
-        qpos.append(env.qpos)
-        paths.append(env.paths)
-    columns = [np.stack(rows) for rows in (observations, actions, qpos, paths)]
-    outcomes, steps = env.outcomes(), env.steps
-    return [
-        recorded_episode(
-            task,
-            columns=[column[:, i] for column in columns],
-            length=int(steps[i]),
-            context=episode.context,
-            outcome=outcomes[i],
-            info={"source": "d3il", "file": Path(episode.name).name},
-        )
-        for i, episode in enumerate(batch)
-    ]
+        recording.step(task.clip(moves.astype(np.float32)))
+    return recording.episodes(
+        [{"source": "d3il", "file": Path(episode.name).name} for episode in batch]
+    )

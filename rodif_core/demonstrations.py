@@ -113,8 +113,7 @@ def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list
         draw_expert(task.name, assignment.mode, context, rng)
         for assignment, context, rng in zip(batch, contexts, generators, strict=True)
     ]
-    observations = [env.reset(contexts)]
-    qpos, paths, actions = [env.qpos], [env.paths], []
+    recording = Recording(env, contexts)
     tremble = np.zeros((len(batch), task.action_dim))
     while not env.done.all():
         action = np.zeros((len(batch), task.action_dim), dtype=np.float32)
@@ -123,29 +122,62 @@ def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list
             fresh = experts[i].tremble * np.sqrt(1 - TREMBLE_MEMORY**2)
             kick = generators[i].normal(0.0, fresh, task.action_dim)
             tremble[i] = TREMBLE_MEMORY * tremble[i] + kick
-            action[i] = task.clip(experts[i].act(observations[-1][i]) + tremble[i])
-        actions.append(action)
-        observations.append(env.step(action))
-        qpos.append(env.qpos)
-        paths.append(env.paths)
-    columns = [np.stack(rows) for rows in (observations, actions, qpos, paths)]
-    outcomes, steps = env.outcomes(), env.steps
-    return [
-        recorded_episode(
-            task,
-            columns=[column[:, i] for column in columns],
-            length=int(steps[i]),
-            context=contexts[i],
-            outcome=outcomes[i],
-            info={
+            action[i] = task.clip(experts[i].act(recording.observations[i]) + tremble[i])
+        recording.step(action)
+    return recording.episodes(
+        [
+            {
                 "seed": seed,
-                "index": batch[i].index,
-                "attempt": batch[i].attempt,
-                "expert": experts[i].to_json(),
-            },
-        )
-        for i in range(len(batch))
-    ]
+                "index": assignment.index,
+                "attempt": assignment.attempt,
+                "expert": expert.to_json(),
+            }
+            for assignment, expert in zip(batch, experts, strict=True)
+        ]
+    )
+
+
+class Recording:
+    """Episodes without decisions, recorded while `env` runs all m of them together."""
+
+    def __init__(self, env: BatchEnv, contexts: Sequence[dict[str, Any]]) -> None:
+        self._env, self._contexts = env, contexts
+        self._observations = [env.reset(contexts)]
+        self._qpos, self._paths = [env.qpos], [env.paths]
+        self._actions: list[NDArray[np.float32]] = []
+
+    @property
+    def observations(self) -> NDArray[np.float32]:
+        """The latest (m, O)."""
+        return self._observations[-1]
+
+    def step(self, actions: NDArray[np.float32]) -> None:
+        """One control step with actions (m, A) within the task's limits."""
+        self._actions.append(actions)
+        self._observations.append(self._env.step(actions))
+        self._qpos.append(self._env.qpos)
+        self._paths.append(self._env.paths)
+
+    def episodes(self, infos: Sequence[dict[str, Any]]) -> list[Trajectory]:
+        """All episodes, once all have ended.
+
+        infos  where each comes from; the task's facts are added
+        """
+        columns = [
+            np.stack(rows) for rows in (self._observations, self._actions, self._qpos, self._paths)
+        ]
+        ends = zip(self._contexts, self._env.outcomes(), self._env.steps, infos, strict=True)
+        return [
+            recorded_episode(
+                self._env.task,
+                columns=[column[:, i] for column in columns],
+                length=int(steps),
+                context=context,
+                outcome=outcome,
+                info=info,
+            )
+            for i, (context, outcome, steps, info) in enumerate(ends)
+        ]
 
 
 def recorded_episode(

@@ -33,7 +33,7 @@ from rodif_core.preferences.pairs import Preference
 from rodif_core.rollout import rollout
 from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Scorer
-from rodif_core.tasks import Task, get_task
+from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -181,18 +181,15 @@ def _try(
     rollouts = rollout(replace(checkpoint, policy=policy), settings)
     off = off_support_share(rollouts, checkpoint)
     success = float(np.mean([trajectory.success for trajectory in rollouts]))
-    return Trial(
-        scale,
-        policy,
-        success,
-        off,
-        len(_liked(get_task(checkpoint.task), rollouts, scores)) / len(rollouts),
-    )
+    liked = _liked(checkpoint, rollouts, scores)
+    return Trial(scale, policy, success, off, len(liked) / len(rollouts))
 
 
-def _liked(task: Task, rollouts: Sequence[Trajectory], scores: Scores) -> list[Trajectory]:
+def _liked(
+    checkpoint: Checkpoint, rollouts: Sequence[Trajectory], scores: Scores
+) -> list[Trajectory]:
     """The rollouts that succeed and that the labels predict to be preferred."""
-    features = PathFeatures.of(rollouts, task)
+    features = PathFeatures.of(rollouts, get_task(checkpoint.task))
     predicted = scores.path_utility.predict(features) > scores.path_threshold
     pairs = zip(rollouts, predicted, strict=True)
     return [trajectory for trajectory, preferred in pairs if preferred and trajectory.success]
@@ -223,9 +220,7 @@ def _self_train(
     steady = rollout(
         replace(checkpoint, policy=chosen.policy), settings, noise_scale=guiding.self_training_noise
     )
-    liked = near_data(
-        checkpoint, _liked(get_task(checkpoint.task), steady, scores), base.off_support
-    )
+    liked = near_data(checkpoint, _liked(checkpoint, steady, scores), base.off_support)
     if not liked:
         return None
     lessons = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)

@@ -21,6 +21,19 @@ from rodif_core.errors import DemonstrationFileError
 
 MAX_BYTES = 50_000_000  # of one file; an episode of a thousand control steps has 1 MB
 _NUMBER = re.compile(r"[fiub?][1248]?")  # floats, integers, truth values
+# What reading may raise. A damaged file does not only lead to the first.
+_DAMAGED = (
+    pickle.UnpicklingError,
+    AttributeError,
+    EOFError,
+    ImportError,
+    LookupError,
+    MemoryError,
+    OverflowError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
 
 
 class StoredType:
@@ -83,11 +96,7 @@ def read_plain_pickle(data: bytes, name: str) -> Any:
         )
     try:
         return _PlainUnpickler(io.BytesIO(data)).load()
-    except (
-        pickle.UnpicklingError,
-        *(EOFError, ValueError, TypeError, AttributeError, LookupError, ImportError),
-        *(OverflowError, MemoryError, RecursionError),
-    ) as error:
+    except _DAMAGED as error:
         raise DemonstrationFileError(f"{name} is not a pickle of plain data: {error}") from error
 
 

@@ -6,7 +6,6 @@ P of them proprioception, O dims of the rows that the policy reads, C cameras of
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -56,8 +55,9 @@ class Sight:
 
         Raises GraphicsError when pictures are needed and this machine cannot draw.
         """
-        if self._camera is None or self._encoder is None:
+        if self._camera is None:
             return observations.copy()
+        assert self._encoder is not None  # a policy with images has one
         felt = torch.tensor(observations[:, : self._task.proprioception_dim])
         parts = []
         for first in range(0, len(qpos), ENCODED_TOGETHER):
@@ -70,12 +70,7 @@ class Sight:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._camera is not None:
             self._camera.close()
 

@@ -12,7 +12,6 @@ from typing import Any
 
 from rodif_core.intervals import wilson_interval
 from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
-from rodif_core.presets import preset_for
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.tasks import get_task
 
@@ -130,20 +129,6 @@ def _shares(counts: dict[str, int], found: int) -> str:
 def _interval(measured: dict[str, Any], name: str) -> str:
     low, high = measured["intervals"][name]
     return f"[{100 * low:.0f}–{100 * high:.0f}]"
-
-
-def preset_differences(checkpoint: Checkpoint) -> dict[str, Any]:
-    """What today's CPU preset says otherwise than the checkpoint's training; empty when nothing."""
-    from dataclasses import asdict
-
-    trained, today = checkpoint.card["preset"], asdict(preset_for(checkpoint.task, "cpu"))
-    plain = {k: list(v) if isinstance(v, tuple) else v for k, v in today["size"].items()}
-    today["size"] = plain
-    return {
-        name: (trained[name], today[name])
-        for name in today
-        if name in trained and trained[name] != today[name]
-    }
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,9 +18,10 @@ from torch import Tensor
 from rodif_core.policies.policy import build_denoiser
 from rodif_core.policies.resnet import ImageConfig, ImageEncoder
 from rodif_core.presets import PRESETS
+from rodif_core.tasks import get_task
 
-OBSERVATION_DIM, ACTION_DIM = 10, 2  # as in Pushing and Sorting
-PROPRIOCEPTION_DIM = 6
+OBSERVATION_DIM = 10  # for every architecture alike; a task's own differs a little
+PROPRIOCEPTION_DIM = 6  # Aligning's
 ENCODERS = {"cpu": ImageConfig(width=16), "paper": ImageConfig(width=64)}
 
 
@@ -59,8 +61,10 @@ def main() -> int:
     torch.manual_seed(0)
     for architecture, presets in PRESETS.items():
         for name in args.presets:
-            size = presets[name].policy_config(OBSERVATION_DIM, ACTION_DIM)
-            noisy = torch.randn(args.batch, size.predicted_steps, ACTION_DIM)
+            size = replace(
+                presets[name].policy_config(get_task("avoid")), observation_dim=OBSERVATION_DIM
+            )
+            noisy = torch.randn(args.batch, size.predicted_steps, size.action_dim)
             k = torch.randint(1, size.denoising_steps + 1, (args.batch,))
             histories = torch.randn(args.batch, size.observation_steps, OBSERVATION_DIM)
             cells = time_module(build_denoiser(size), (noisy, k, histories), args.repeat)

@@ -39,7 +39,7 @@ def parallel_rollout(
     if processes == 1:
         return rollout(checkpoint, config, progress=progress)
     with pool_of(processes) as pool:
-        return spread(pool, processes, checkpoint, config, progress=progress)
+        return _spread(pool, processes, checkpoint, config, progress=progress)
 
 
 def pool_of(processes: int) -> ProcessPoolExecutor:
@@ -55,7 +55,7 @@ def pool_of(processes: int) -> ProcessPoolExecutor:
     )
 
 
-def spread(
+def _spread(
     pool: ProcessPoolExecutor,
     shares: int,
     checkpoint: Checkpoint,

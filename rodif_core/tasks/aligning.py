@@ -179,16 +179,10 @@ class AligningStateTask(Task):
         colours = blocks.colours({"box": GREY, "target": (0.80, 0.82, 0.85)})
         return [
             *(
-                blocks.cube_shape(i, name, places[i], colours[name]) | {"half": HALF}
+                blocks.cube_shape(i, name, places[i], colours[name], (HALF, HALF, TOP / 2))
                 for i, name in reversed(list(enumerate(self.objects)))
             ),
-            {
-                "type": "workspace",
-                "x0": MIN_X,
-                "y0": -0.38,
-                "x1": blocks.MAX_X,
-                "y1": 0.42,
-            },
+            {"type": "workspace", "x0": MIN_X, "y0": -0.38, "x1": blocks.MAX_X, "y1": 0.42},
             {"type": "start", "x": START[0], "y": START[1]},
         ]
 

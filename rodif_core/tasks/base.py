@@ -95,6 +95,11 @@ class Task(ABC):
         """What turns set-points of up to `count` simulations into servo targets."""
         return RodControl(count, threads)
 
+    @property
+    def action_limits(self) -> Array:
+        """`action_limit` axis by axis (A,)."""
+        return np.full(self.action_dim, self.action_limit, dtype=np.float64)
+
     def clip(self, actions: NDArray[ActionT]) -> NDArray[ActionT]:
         """Actions (…, A) within +- action_limit, in their own precision."""
         limit = np.asarray(self.action_limit, dtype=actions.dtype)

@@ -3,7 +3,7 @@
 The OpenGL context is made by the first picture and not before, in the process and thread that draw:
 a child forked from a process that has drawn with EGL would hang in its first picture, so that is
 refused. Which OpenGL is used is looked up at that moment too, because `import mujoco` with
-MUJOCO_GL=egl fails where there is none: rollouts and replays need no OpenGL.
+MUJOCO_GL=egl fails where there is none, and most of what is done here needs no OpenGL.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import os
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 import mujoco
@@ -78,10 +77,16 @@ class Camera:
         """Names of the scene's cameras."""
         return [self._model.camera(i).name for i in range(self._model.ncam)]
 
-    @property
-    def graphics(self) -> str:
-        """Which OpenGL draws, such as "egl"; made now if there is none. Raises GraphicsError."""
-        self._begin()
+    def start(self) -> str:
+        """Make an OpenGL context, unless there is one, and make it current, as `picture` does;
+        which OpenGL it is, such as "egl". Raises GraphicsError when this machine cannot draw."""
+        if self._context is not None:
+            self._gl.make_current()
+            return self._name
+        self._name, self._gl = _new_context(*self._size)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         return self._name
 
     def picture(
@@ -98,7 +103,7 @@ class Camera:
         cannot draw.
         """
         seen_from = self._view(view)
-        self._begin()
+        self.start()
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -124,12 +129,7 @@ class Camera:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _view(self, view: str | mujoco.MjvCamera) -> mujoco.MjvCamera:
@@ -141,16 +141,6 @@ class Camera:
         camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         camera.fixedcamid = self._model.camera(view).id
         return camera
-
-    def _begin(self) -> None:
-        """Make the context with the first picture, and make it current."""
-        if self._context is not None:
-            self._gl.make_current()
-            return
-        self._name, self._gl = _new_context(*self._size)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
     def _add(self, trail: Trail) -> None:
         colour = np.array(trail.rgba, dtype=np.float32)
@@ -208,4 +198,4 @@ def _usual() -> str:
 
 def _advice(packages: str) -> str:
     install = f"On Debian or Ubuntu: sudo apt-get install -y {packages}. " if packages else ""
-    return f"{install}`rodif doctor` checks it; rollouts, replays and labelling need no OpenGL"
+    return f"{install}`rodif doctor` checks it; only films and tasks with cameras need OpenGL"

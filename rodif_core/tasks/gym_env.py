@@ -29,7 +29,7 @@ class GymEnv(gymnasium.Env[Observation, Action]):
         self._task = task
         self._env = BatchEnv(task, 1)
         self.render_mode = None
-        limits = task.clip(np.full(task.action_dim, np.inf, dtype=np.float32))
+        limits = task.action_limits.astype(np.float32)
         self.action_space = gymnasium.spaces.Box(-limits, limits, dtype=np.float32)
         self.observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (task.observation_dim,), np.float32

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import mujoco.batch
 import numpy as np
 import pytest
 import torch
@@ -42,7 +44,7 @@ def test_rates_follow_from_what_was_measured():
 
 def test_shortfalls_name_the_task_and_both_figures():
     assert rollouts.shortfalls([ROW]) == []
-    slow = rollouts.replace(ROW, plain_steps_per_s=380.0, physics_s=0.1, network_s=0.3)
+    slow = replace(ROW, plain_steps_per_s=380.0, physics_s=0.1, network_s=0.3)
     assert rollouts.shortfalls([ROW, slow]) == [
         "avoid: 10.0 times the plain loop on 2 cores, less than 20",
         "avoid: 5.00 times the sum of its parts, more than 2",
@@ -56,7 +58,7 @@ def test_raw_physics_gives_the_motion_of_the_episodes(monkeypatch: pytest.Monkey
     episodes = rollout(tiny_checkpoint(), RolloutConfig(episodes=2, seed=3))
     made = []
 
-    class Watched(rollouts_batch()):  # type: ignore[misc]
+    class Watched(mujoco.batch.Batch):
         def __init__(self, *arguments: object) -> None:
             super().__init__(*arguments)
             made.append(self)
@@ -66,12 +68,6 @@ def test_raw_physics_gives_the_motion_of_the_episodes(monkeypatch: pytest.Monkey
     ends = made[0].bind("qpos")
     for end, episode in zip(ends, episodes, strict=True):
         assert np.abs(end - episode.qpos[-1]).max() < 0.05  # rad; servos lag
-
-
-def rollouts_batch() -> type:
-    import mujoco.batch
-
-    return mujoco.batch.Batch
 
 
 def test_raw_network_calls_the_policy_on_what_it_saw(monkeypatch: pytest.MonkeyPatch):
@@ -131,5 +127,15 @@ def test_the_command_measures_prints_and_writes(tmp_path: Path, capsys: pytest.C
 
 
 def test_the_fine_tuners_benchmark_still_wants_a_file(capsys: pytest.CaptureFixture[str]):
-    assert main(["bench", "avoid"]) == 1
-    assert "needs --json FILE" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["bench", "avoid"])
+    assert "arguments are required: --json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("foreign", [["avoid", "--tasks", "avoid"], ["rollouts", "--seeds", "1"]])
+def test_a_benchmark_refuses_the_options_of_the_other(
+    foreign: list[str], capsys: pytest.CaptureFixture[str]
+):
+    with pytest.raises(SystemExit, match="2"):
+        main(["bench", *foreign, "--json", "rows.json"])
+    assert f"unrecognized arguments: {foreign[1]}" in capsys.readouterr().err

@@ -74,5 +74,7 @@ def test_sizes_out_of_range_are_named(capsys: pytest.CaptureFixture[str]):
         DemoConfig(flip_rate=0.5)
     with pytest.raises(RodifError, match="pairs is 0"):
         DemoConfig(pairs=0)
+    with pytest.raises(RodifError, match="evaluation_episodes is 0"):
+        DemoConfig(evaluation_episodes=0)
     assert main(["demo", "--headless", "--labels", "0"]) == 1
     assert "labels is 0, but must be at least 1" in capsys.readouterr().err

@@ -58,6 +58,7 @@ def test_a_malicious_file_stops_the_import(
         (["import", "juggling", "x.pkl"], "unknown task 'juggling'; legal values are 'avoid'"),
         (["import", "avoid", "nowhere.pkl"], "nowhere.pkl does not exist"),
         (["avoid", "x.pkl"], "unexpected 'x.pkl'"),
+        (["import", "avoid", "x.pkl", "--n", "3"], "--n is for scripted demonstrations"),
     ],
 )
 def test_wrong_arguments_are_told(

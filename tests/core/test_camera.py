@@ -110,7 +110,7 @@ def test_without_gl_libraries_it_says_what_to_install(monkeypatch: pytest.Monkey
         pytest.raises(GraphicsError, match=r"no libEGL.*apt-get install -y libegl1.*rodif doctor"),
         Camera(get_task("avoid"), *SIZE) as camera,
     ):
-        _ = camera.graphics
+        camera.start()
 
 
 def test_an_unknown_mujoco_gl_names_the_legal_ones(monkeypatch: pytest.MonkeyPatch):
@@ -119,13 +119,13 @@ def test_an_unknown_mujoco_gl_names_the_legal_ones(monkeypatch: pytest.MonkeyPat
         pytest.raises(GraphicsError, match="'vulkan'; legal values are egl, osmesa"),
         Camera(get_task("avoid"), *SIZE) as camera,
     ):
-        _ = camera.graphics
+        camera.start()
 
 
 def _draw_in_child(answers: Any) -> None:
     try:
         with Camera(get_task("avoid"), *SIZE) as camera:
-            _ = camera.graphics
+            camera.start()
     except GraphicsError as error:
         answers.put(str(error))
     else:

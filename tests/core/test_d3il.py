@@ -67,15 +67,15 @@ def test_steps_that_are_too_long_are_clipped_and_made_up_for(
 ):
     task = get_task("avoid")
     record = d3il_record(task, shown[0])
-    # Half of the rows left out: twice the speed, which no action may have.
-    record["robot"]["des_c_pos"] = record["robot"]["des_c_pos"][::2]
+    # Three rows are missing: a step of four, which no action may take at once.
+    record["robot"]["des_c_pos"] = np.delete(record["robot"]["des_c_pos"], slice(20, 23), axis=0)
     episode = read_episode(TaskName.AVOID, write_record(tmp_path / "quick.pkl", record))
-    made, rejected = replay(task, [episode])
-    lengths = [len(one.actions) for one in made]
-    assert len(made) + len(rejected) == 1
-    for one in made:
-        assert np.abs(one.actions).max() == np.float32(task.action_limit)
-        assert lengths[0] > len(episode.setpoints)
+    assert np.abs(np.diff(episode.setpoints, axis=0)).max() > 2 * task.action_limit
+    ((one,), rejected) = replay(task, [episode])
+    assert rejected == []
+    assert np.abs(one.actions).max() == np.float32(task.action_limit)
+    last = len(one.actions)
+    assert np.allclose(one.observations[last, :2], episode.setpoints[last], atol=1e-6)
 
 
 def test_failed_replays_and_foreign_starts_are_told_with_their_files(
@@ -133,6 +133,15 @@ def test_an_episode_that_does_not_hold_together_is_refused(
     record = broken(d3il_record(get_task("avoid"), shown[0]), **change)
     with pytest.raises(DemonstrationFileError, match=message):
         read_episode(TaskName.AVOID, write_record(tmp_path / "x.pkl", record))
+
+
+def test_a_gripper_that_was_recorded_for_fewer_rows_than_the_joints_is_refused(tmp_path: Path):
+    robot = {"des_c_pos": np.zeros((3, 3)), "des_j_pos": np.zeros((3, 7))}
+    robot["gripper_width"] = np.zeros(2)
+    pose = {"pos": np.zeros((3, 3)), "quat": np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))}
+    record = {"robot": robot} | dict.fromkeys(FORMATS[TaskName.STACKING].places.values(), pose)
+    with pytest.raises(DemonstrationFileError, match="has 2 rows, but must have 3, as 'des_j_pos"):
+        read_episode(TaskName.STACKING, write_record(tmp_path / "x.pkl", record))
 
 
 def test_a_file_of_another_task_is_refused(shown: list[Trajectory], tmp_path: Path):

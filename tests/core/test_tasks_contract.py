@@ -344,8 +344,10 @@ def test_constants_agree_with_each_other(task: Task) -> None:
     assert len(set(task.modes)) == len(task.modes)
     assert task.preferred_group in task.groups
     assert task.criterion.endswith(".")
-    limits = task.clip(np.full(task.action_dim, np.inf))
-    assert (limits > 0).all() and np.array_equal(task.clip(-2 * limits), -limits)
+    limits = task.action_limits
+    assert limits.shape == (task.action_dim,) and (limits > 0).all()
+    assert np.array_equal(task.clip(-2 * limits), -limits)
+    assert np.array_equal(task.clip(np.full(task.action_dim, np.inf)), limits)
     assert task.control_dt > 0
 
 

@@ -15,10 +15,11 @@ from PIL import Image
 from playwright.sync_api import Page
 
 from labeling_ui.film import GROUP, HOLD_MS, check_film_path, write_film
-from labeling_ui.mosaic import CAPTION, GAP, HEADER, Mosaic, colours_of_groups, columns_of
+from labeling_ui.mode_plot import colours_of_groups
+from labeling_ui.mosaic import CAPTION, GAP, HEADER, Mosaic, columns_of
 from rodif_core.demonstrations import make_demonstrations
 from rodif_core.errors import ValueOutOfRangeError
-from rodif_core.tasks import TASKS, get_task
+from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
 
 FRAME_MS = 40
@@ -161,10 +162,3 @@ def test_tiles_differ_and_show_their_own_group(episodes: list[Trajectory]):
 
 def test_grids_have_room_for_all_tiles():
     assert [columns_of(n) for n in (1, 2, 4, 5, 9, 10, 12)] == [1, 2, 2, 3, 3, 4, 4]
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_every_task_has_a_colour_for_each_group(name: str):
-    task = get_task(name)
-    assert list(colours_of_groups(task))[0] == task.preferred_group
-    assert set(colours_of_groups(task)) == {*task.groups, "failed"}

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from rodif_core.errors import RodifError
 from rodif_core.spec import FinetuneMethod, TaskName
 from worker.cli.benchmarks import avoid, rollouts
+from worker.cli.benchmarks.rollout_tables import parts_table, rates_table
 from worker.cli.options import number_list
 from worker.parallel import pool_of
 
@@ -144,13 +145,9 @@ def _cell(numbers: tuple[float, ...]) -> str:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
     parser = subparsers.add_parser("bench", help="compare the fine-tuners; time rollouts")
-    parser.add_argument("what", choices=[TaskName.AVOID.value, "rollouts"])
-    parser.add_argument(
-        "--json",
-        type=Path,
-        help="file of rows; kept and completed by avoid, which needs it, written by rollouts",
-    )
-    fine = parser.add_argument_group("avoid: the fine-tuners on fresh seeds")
+    kinds = parser.add_subparsers(dest="what", required=True)
+    fine = kinds.add_parser(TaskName.AVOID.value, help="the fine-tuners on fresh seeds")
+    fine.add_argument("--json", type=Path, required=True, help="file of rows; kept and completed")
     fine.add_argument(
         "--seeds",
         type=number_list,
@@ -170,7 +167,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     fine.add_argument("--n", type=int, default=200, help="rollouts a row (default %(default)s)")
     fine.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
     fine.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
-    timing = parser.add_argument_group("rollouts: how quick they are")
+    timing = kinds.add_parser("rollouts", help="how quick rollouts are")
+    timing.add_argument("--json", type=Path, help="file of rows to write")
     timing.add_argument(
         "--tasks",
         nargs="+",
@@ -187,8 +185,6 @@ def run(args: argparse.Namespace) -> int:
     """Compare or time; 1 when a target is missed."""
     if args.what == "rollouts":
         return _time_rollouts(args.tasks, args.episodes, args.json)
-    if args.json is None:
-        raise RodifError("`rodif bench avoid` needs --json FILE, which keeps its rows")
 
     from rich.console import Console
 
@@ -222,8 +218,8 @@ def _time_rollouts(names: Sequence[str] | None, episodes: int, file: Path | None
     if file is not None:
         write_rows(file, [row.to_json() for row in rows])
     console = Console()
-    console.print(rollouts.rates_table(rows))
-    console.print(rollouts.parts_table(rows))
+    console.print(rates_table(rows))
+    console.print(parts_table(rows))
     missed = rollouts.shortfalls(rows)
     for sentence in missed:
         console.print(f"missed: {sentence}", soft_wrap=True)

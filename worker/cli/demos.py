@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rodif_core.trajectory import Trajectory
 
 IMPORT = "import"
+EPISODES = 100
 SHOWN_REJECTIONS = 5  # files named after an import; the counts tell of all
 
 
@@ -31,8 +32,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "paths", nargs="*", metavar="PATH", help="for import: the task, then files or folders"
     )
     parser.add_argument("--out", type=Path, required=True, help="file to write (npz)")
-    parser.add_argument("--n", type=int, default=100, help="demonstrations (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
+    # No defaults here: an import refuses these, and must know whether they were given.
+    parser.add_argument("--n", type=int, help=f"demonstrations (default {EPISODES})")
+    parser.add_argument("--seed", type=int, help="(default 0)")
     parser.add_argument(
         "--preferred-share",
         type=float,
@@ -43,7 +45,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Make or import them with a progress bar, write the file, say what is in it."""
     if args.what == IMPORT:
+        for option in ("n", "seed", "preferred_share"):
+            if getattr(args, option) is not None:
+                raise RodifError(
+                    f"--{option.replace('_', '-')} is for scripted demonstrations;"
+                    " `rodif demos import` has no option but --out"
+                )
         return _import(args.paths, args.out)
+    episodes = EPISODES if args.n is None else args.n
     if args.paths:
         raise RodifError(
             f"unexpected {args.paths[0]!r}; files are only read by `rodif demos import TASK PATH`"
@@ -56,11 +65,11 @@ def run(args: argparse.Namespace) -> int:
     from rodif_core.tasks import get_task
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task("demonstrations", total=args.n)
+        row = bar.add_task("demonstrations", total=episodes)
         made = make_demonstrations(
             get_task(args.what),
-            episodes=args.n,
-            seed=args.seed,
+            episodes=episodes,
+            seed=args.seed or 0,
             preferred_share=args.preferred_share,
             progress=lambda done, _: bar.update(row, completed=done),
         )

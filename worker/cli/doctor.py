@@ -39,7 +39,7 @@ task = get_task("avoid")
 with Camera(task, 64, 48) as camera:
     picture = camera.picture([0.0] * 7)
     assert picture.max() > 0, "the picture is black"
-    print(camera.graphics)
+    print(camera.start())
 """
 
 Status = Literal["ok", "warn", "fail"]
@@ -80,7 +80,7 @@ def check_packages() -> Finding:
 def check_gl() -> Finding:
     """An off-screen picture in a process of its own, since a broken driver can take it down."""
     advice = (
-        "only films and image observations need it: on Debian or Ubuntu,"
+        "only films and tasks with cameras need it: on Debian or Ubuntu,"
         " apt-get install libegl1 libgl1-mesa-dri libopengl0"
     )
     try:

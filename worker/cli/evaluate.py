@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rodif_core.errors import CheckpointFileError
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
 from worker.cli.options import add_json_argument, give_json
+
+if TYPE_CHECKING:
+    from rodif_core.policies.checkpoint import Checkpoint
+    from rodif_core.trajectory import Trajectory
 
 
 def read_checkpoint(name: str) -> bytes:
@@ -28,6 +33,25 @@ def read_checkpoint(name: str) -> bytes:
         ) from error
 
 
+def rolled_out(
+    checkpoint: Checkpoint, config: RolloutConfig, processes: int = 1
+) -> list[Trajectory]:
+    """Rollouts, with a progress bar beside what is printed."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from worker.parallel import parallel_rollout
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        row = bar.add_task("rollouts", total=config.episodes)
+        return parallel_rollout(
+            checkpoint,
+            config,
+            processes,
+            progress=lambda done, _: bar.update(row, completed=done),
+        )
+
+
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
     parser = subparsers.add_parser("evaluate", help="roll a checkpoint out and sum up")
@@ -45,23 +69,13 @@ def run(args: argparse.Namespace) -> int:
     config = RolloutConfig(episodes=args.n, seed=args.seed)
 
     from rich.console import Console
-    from rich.progress import Progress
 
     from rodif_core.evaluate import summarise
     from rodif_core.policies.checkpoint import load_checkpoint
     from worker.cli.tables import evaluation_table
-    from worker.parallel import parallel_rollout
 
     checkpoint = load_checkpoint(read_checkpoint(args.checkpoint))
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task("rollouts", total=config.episodes)
-        episodes = parallel_rollout(
-            checkpoint,
-            config,
-            args.processes,
-            progress=lambda done, _: bar.update(row, completed=done),
-        )
-    result = summarise(checkpoint, episodes).to_json()
+    result = summarise(checkpoint, rolled_out(checkpoint, config, args.processes)).to_json()
     facts = {"task": checkpoint.task.value, "checkpoint": checkpoint.digest, "seed": args.seed}
     if give_json(result | facts, args.json):
         return 0

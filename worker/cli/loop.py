@@ -45,7 +45,9 @@ class DemoConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("episodes", "pairs", "labels", "annotators", "comparison_updates"):
+        # All of these are looked at before anything starts, not when the loop comes to them.
+        sizes = ("episodes", "pairs", "labels", "annotators", "evaluation_episodes")
+        for name in (*sizes, "comparison_updates"):
             if getattr(self, name) < 1:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
         if not 0 <= self.flip_rate < 0.5:

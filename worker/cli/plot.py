@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rodif_core.spec import RolloutConfig
-from worker.cli.evaluate import read_checkpoint
+from worker.cli.evaluate import read_checkpoint, rolled_out
 
 if TYPE_CHECKING:
     from rodif_core.trajectory import Trajectory
@@ -52,13 +52,6 @@ def _episodes(source: str, config: RolloutConfig) -> Sequence[Trajectory]:
 
         return load_demonstrations(Path(source))[: config.episodes]
 
-    from rich.console import Console
-    from rich.progress import Progress
-
     from rodif_core.policies.checkpoint import load_checkpoint
-    from rodif_core.rollout import rollout
 
-    checkpoint = load_checkpoint(read_checkpoint(source))
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task("rollouts", total=config.episodes)
-        return rollout(checkpoint, config, progress=lambda done, _: bar.update(row, completed=done))
+    return rolled_out(load_checkpoint(read_checkpoint(source)), config)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import CheckpointFileError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
-from worker.cli.evaluate import read_checkpoint
+from worker.cli.evaluate import read_checkpoint, rolled_out
 from worker.cli.options import add_json_argument, give_json
 
-if TYPE_CHECKING:
-    from rich.console import Console
+MAP_DATA = ("paths", "path_groups")  # of an evaluation, for the site's maps; the film shows more
 
+if TYPE_CHECKING:
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.trajectory import Trajectory
 
@@ -52,8 +52,6 @@ def run(args: argparse.Namespace) -> int:
     if args.speed < 1:
         raise ValueOutOfRangeError("speed", args.speed, "at least 1")
 
-    from rich.console import Console
-
     from labeling_ui.film import check_film_path
     from rodif_core.demonstrations import save_demonstrations
     from rodif_core.evaluate import summarise
@@ -64,10 +62,9 @@ def run(args: argparse.Namespace) -> int:
         check_film_path(args.video)
         # Told now and not after the rollouts.
         with Camera(get_task(args.task), 32, 24) as camera:
-            _ = camera.graphics
+            camera.start()
     checkpoint = _checkpoint(TaskName(args.task), args.checkpoint)
-    progress = Console(stderr=True)
-    episodes = _rolled_out(checkpoint, config, args.processes, progress)
+    episodes = rolled_out(checkpoint, config, args.processes)
     report = summarise(checkpoint, episodes).to_json() | {
         "task": checkpoint.task.value,
         "checkpoint": checkpoint.digest,
@@ -80,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         save_demonstrations(args.out, episodes)
     if args.video is not None:
-        _film(args, report, episodes, progress)
-    kept = {name: value for name, value in report.items() if not name.startswith("path")}
+        _film(args, report, episodes)
+    kept = {name: value for name, value in report.items() if name not in MAP_DATA}
     if not give_json(kept, args.json):
         _print(kept, [path for path in (args.out, args.video) if path is not None])
     return 0
@@ -99,23 +96,6 @@ def _checkpoint(task: TaskName, file: str | None) -> Checkpoint:
     return checkpoint
 
 
-def _rolled_out(
-    checkpoint: Checkpoint, config: RolloutConfig, processes: int, console: Console
-) -> list[Trajectory]:
-    from rich.progress import Progress
-
-    from worker.parallel import parallel_rollout
-
-    with Progress(console=console, transient=True) as bar:
-        row = bar.add_task("rollouts", total=config.episodes)
-        return parallel_rollout(
-            checkpoint,
-            config,
-            processes,
-            progress=lambda done, _: bar.update(row, completed=done),
-        )
-
-
 def _steps(episodes: Sequence[Trajectory]) -> dict[str, float]:
     """Control steps of the episodes: mean, fewest, most."""
     steps = [len(one.actions) for one in episodes]
@@ -126,8 +106,8 @@ def _film(
     args: argparse.Namespace,
     report: dict[str, Any],
     episodes: Sequence[Trajectory],
-    console: Console,
 ) -> None:
+    from rich.console import Console
     from rich.progress import Progress
 
     from labeling_ui.film import write_film
@@ -146,7 +126,7 @@ def _film(
         stride=args.speed,
         mesh="viz" if args.detailed else "col",
     )
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console=Console(stderr=True), transient=True) as bar:
         row = bar.add_task("film", total=mosaic.frame_count)
 
         def counted() -> Iterator[Any]:

@@ -15,8 +15,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def facts() -> list[dict[str, Any]]:
     """One row a task, as JSON types."""
-    import numpy as np
-
     from rodif_core.shipped import shipped_tasks
     from rodif_core.tasks import TASKS
 
@@ -27,7 +25,7 @@ def facts() -> list[dict[str, Any]]:
             "cameras": list(task.cameras),
             "proprioception_dim": task.proprioception_dim,
             "action_dim": task.action_dim,
-            "action_limits": task.clip(np.full(task.action_dim, np.inf)).tolist(),
+            "action_limits": task.action_limits.tolist(),
             "control_dt": task.control_dt,
             "max_steps": task.max_steps,
             "objects": list(task.objects),

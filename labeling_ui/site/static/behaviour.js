@@ -50,11 +50,13 @@ function barRow(name, evaluation, key) {
 }
 
 // Groups keep their colour on every map: the preferred one in the accent colour, failures in red.
+const OTHER_GROUPS = ["#b07a1e", "#8a5fb0", "#5d7f3a", "#7a6a5a", "#c2588f"]; // as many as any task has
+
 export function groupColour(group, facts) {
   if (group === "failed") return "var(--bad)";
   if (group === facts.preferred_group) return "var(--accent)";
   const others = (facts.groups ?? []).filter((name) => name !== facts.preferred_group);
-  return ["#b07a1e", "#8a5fb0", "#5d7f3a", "#7a6a5a"][Math.max(0, others.indexOf(group)) % 4];
+  return OTHER_GROUPS[Math.max(0, others.indexOf(group))];
 }
 
 const MARGIN = 0.03; // m around the work space

@@ -1,1 +1,1 @@
-"""Benchmarks of the fine-tuners, one module a task."""
+"""Benchmarks: of the fine-tuners, one module a task, and of rollouts."""

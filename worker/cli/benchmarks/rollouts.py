@@ -16,17 +16,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import RolloutConfig, TaskName
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.trajectory import Trajectory
+
+Made = TypeVar("Made")
 
 CORES = (1, 2)
 PLAIN_STEPS = 400  # control steps of the plain loop, which is slow
@@ -107,16 +107,12 @@ def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
     checkpoint = policy_of(task)
     config = RolloutConfig(episodes, SEED, max_parallel=episodes)
     rollout(checkpoint, replace(config, episodes=2))  # what happens once only is not measured
-    started = time.process_time()
-    made = rollout(checkpoint, config)
-    batch_s = time.process_time() - started
+    batch_s, made = timed(lambda: rollout(checkpoint, config))
     steps = sum(len(one.actions) for one in made)
     rates = {1: steps / batch_s}
     for cores in CORES[1:]:
         rates[cores] = _rate_in_processes(checkpoint, config, cores, pool)
-    started = time.process_time()
-    plain_steps = plain_loop(checkpoint, PLAIN_STEPS)
-    plain_s = time.process_time() - started
+    plain_s, plain_steps = timed(lambda: plain_loop(checkpoint, PLAIN_STEPS))
     return Row(
         task=task.value,
         policy="shipped" if task in shipped_tasks() else "random",
@@ -130,16 +126,15 @@ def measure(task: TaskName, episodes: int, pool: ProcessPoolExecutor) -> Row:
     )
 
 
-def cpu_seconds(work: Callable[[], object]) -> float:
-    """CPU seconds of this process that the work takes."""
+def timed(work: Callable[[], Made]) -> tuple[float, Made]:
+    """CPU seconds of this process that the work takes, and what it makes."""
     started = time.process_time()
-    work()
-    return time.process_time() - started
+    made = work()
+    return time.process_time() - started, made
 
 
 def policy_of(task: TaskName) -> Checkpoint:
     """The task's shipped checkpoint; where there is none, its CPU preset with fresh weights."""
-    import numpy as np
     import torch
 
     from rodif_core.policies.checkpoint import Checkpoint, SupportSet, load_checkpoint
@@ -152,9 +147,9 @@ def policy_of(task: TaskName) -> Checkpoint:
         return load_checkpoint(shipped_checkpoint(task))
     scene = get_task(task)
     config = preset_for(task, "cpu").policy_config(scene)
-    limits = np.broadcast_to(np.asarray(scene.action_limit, np.float32), (scene.action_dim,))
     middle, span = torch.zeros(scene.observation_dim), torch.ones(scene.observation_dim)
-    scales = Normaliser(middle, span, torch.zeros(scene.action_dim), torch.tensor(limits.copy()))
+    limits = torch.tensor(scene.action_limits, dtype=torch.float32)
+    scales = Normaliser(middle, span, torch.zeros(scene.action_dim), limits)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         policy = DiffusionPolicy.build(config, scales)
@@ -184,9 +179,8 @@ def _timed_rollout(checkpoint: bytes, config: RolloutConfig) -> tuple[int, float
     torch.set_num_threads(1)
     loaded = load_checkpoint(checkpoint)
     rollout(loaded, replace(config, episodes=2))
-    started = time.process_time()
-    made = rollout(loaded, config)
-    return sum(len(one.actions) for one in made), time.process_time() - started
+    seconds, made = timed(lambda: rollout(loaded, config))
+    return sum(len(one.actions) for one in made), seconds
 
 
 def plain_loop(checkpoint: Checkpoint, least_steps: int) -> int:
@@ -242,7 +236,7 @@ def physics_seconds(task: Any, episodes: Sequence[Trajectory]) -> float:
     for step in range(int(lengths.max())):
         ids = np.flatnonzero(lengths > step)
         ctrl[ids] = np.stack([episodes[int(i)].qpos[step + 1][joints] for i in ids])
-        total += cpu_seconds(functools.partial(batch.step, ids, physics_steps))
+        total += timed(functools.partial(batch.step, ids, physics_steps))[0]
     return total
 
 
@@ -259,62 +253,8 @@ def network_seconds(checkpoint: Checkpoint, episodes: Sequence[Trajectory]) -> f
     for decision in range(max(len(one.histories) for one in episodes)):
         rows = [one.histories[decision] for one in episodes if decision < len(one.histories)]
         histories, noise = torch.from_numpy(np.stack(rows)), torch.randn(len(rows), *shape)
-        total += cpu_seconds(functools.partial(policy.act, histories, noise))
+        total += timed(functools.partial(policy.act, histories, noise))[0]
     return total
-
-
-def _narrow_table(title: str) -> Table:
-    """A table without rules between its columns, which there are many of."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-
-
-def rates_table(rows: Sequence[Row]) -> Table:
-    """Episodes and control steps per CPU second, one line a task."""
-    table = _narrow_table("per CPU second")
-    table.add_column("task", no_wrap=True)
-    episodes = ("episodes\n1 core", "episodes\n2 cores")
-    headings = ("policy", "n", *episodes, "steps\n1 core", "steps\n2 cores", "steps\nplain")
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(
-            row.task,
-            row.policy,
-            str(row.episodes),
-            *(f"{row.episodes_per_s(cores):.1f}" for cores in CORES),
-            *(f"{row.steps_per_s[cores]:.0f}" for cores in CORES),
-            f"{row.plain_steps_per_s:.0f}",
-        )
-    table.caption = (
-        "n episodes on each core; steps: control steps; plain: one simulation in a loop. random:"
-        " no checkpoint is shipped, the CPU preset has fresh weights, so its episodes run to their"
-        " ends and hardly touch anything"
-    )
-    return table
-
-
-def parts_table(rows: Sequence[Row]) -> Table:
-    """What is gained on the plain loop, and where one core's time goes, one line a task."""
-    table = _narrow_table("times the plain loop; µs of CPU a control step")
-    table.add_column("task", no_wrap=True)
-    gains = ("gain\n1 core", "gain\n2 cores")
-    headings = (*gains, "whole\nµs", "physics\nµs", "network\nµs", "rest\nµs", "whole/\nparts")
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        parts = (row.batch_s, row.physics_s, row.network_s)
-        rest = row.batch_s - row.physics_s - row.network_s
-        table.add_row(
-            row.task,
-            *(f"{row.speedup(cores):.1f}" for cores in CORES),
-            *(f"{1e6 * part / row.steps:.0f}" for part in (*parts, rest)),
-            f"{row.overhead:.2f}",
-        )
-    table.caption = "physics and network: the same episodes' work alone; parts: their sum"
-    return table
 
 
 def shortfalls(rows: Sequence[Row]) -> list[str]:
