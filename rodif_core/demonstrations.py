@@ -158,58 +158,48 @@ class Recording:
         self._qpos.append(self._env.qpos)
         self._paths.append(self._env.paths)
 
-    def episodes(self, infos: Sequence[dict[str, Any]]) -> list[Trajectory]:
+    def episodes(
+        self, infos: Sequence[dict[str, Any]], begins: Sequence[int] | None = None
+    ) -> list[Trajectory]:
         """All episodes, once all have ended.
 
-        infos  where each comes from; the task's facts are added
+        infos   where each comes from; the task's facts are added
+        begins  the control step that each is kept from, by default all of it
         """
-        columns = [
-            np.stack(rows) for rows in (self._observations, self._actions, self._qpos, self._paths)
-        ]
         ends = zip(self._contexts, self._env.outcomes(), self._env.steps, infos, strict=True)
         return [
-            recorded_episode(
-                self._env.task,
-                columns=[column[:, i] for column in columns],
-                length=int(steps),
-                context=context,
-                outcome=outcome,
-                info=info,
-            )
+            self._episode(i, begins[i] if begins else 0, int(steps), context, outcome, info)
             for i, (context, outcome, steps, info) in enumerate(ends)
         ]
 
+    def _episode(
+        self,
+        index: int,
+        begin: int,
+        end: int,
+        context: dict[str, Any],
+        outcome: dict[str, Any],
+        info: dict[str, Any],
+    ) -> Trajectory:
+        def cut(rows: list[NDArray[np.float32]], end: int) -> NDArray[np.float32]:
+            return np.array([row[index] for row in rows[begin:end]], dtype=np.float32)
 
-def recorded_episode(
-    task: Task,
-    columns: Sequence[NDArray[np.float32]],
-    length: int,
-    context: dict[str, Any],
-    outcome: dict[str, Any],
-    info: dict[str, Any],
-) -> Trajectory:
-    """One episode without decisions, cut out of what many steps recorded.
-
-    columns  observations, actions, qpos, paths, each with a row a control step
-    length   control steps of this episode
-    info     where it comes from; the task's facts are added
-    """
-    observations, actions, qpos, paths = columns
-    return episode_without_decisions(
-        observations=observations[: length + 1].copy(),
-        actions=actions[:length].copy(),
-        qpos=qpos[: length + 1].copy(),
-        paths=paths[: length + 1].copy(),
-        context=context,
-        outcome=outcome,
-        info={
-            "task": task.name.value,
-            "mode": outcome["mode"],
-            "control_dt": task.control_dt,
-            "mujoco_version": mujoco.__version__,
-            **info,
-        },
-    )
+        task = self._env.task
+        return episode_without_decisions(
+            observations=cut(self._observations, end + 1),
+            actions=cut(self._actions, end).reshape(-1, task.action_dim),
+            qpos=cut(self._qpos, end + 1),
+            paths=cut(self._paths, end + 1),
+            context=context,
+            outcome=outcome,
+            info={
+                "task": task.name.value,
+                "mode": outcome["mode"],
+                "control_dt": task.control_dt,
+                "mujoco_version": mujoco.__version__,
+                **info,
+            },
+        )
 
 
 def save_demonstrations(path: Path, demonstrations: Sequence[Trajectory]) -> None:

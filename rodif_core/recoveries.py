@@ -10,12 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rodif_core.demonstrations import recorded_episode
+from rodif_core.demonstrations import Recording
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.rollout import rollout
 from rodif_core.spec import RolloutConfig
@@ -59,7 +57,7 @@ def _draw(task: Task, driven: Trajectory) -> _Takeover:
     # A stream of its own, apart from the episode's start and the policy's noise.
     rng = np.random.default_rng([driven.info["seed"], 2])
     latest = min(len(driven.actions), int(LATEST * task.max_steps))
-    step = min(latest, int(rng.integers(1, max(latest, 2))))
+    step = int(rng.integers(1, latest)) if latest > 1 else 0
     return _Takeover(driven, step, _likeliest_expert(task, driven, step, rng))
 
 
@@ -83,51 +81,26 @@ def _likeliest_expert(
 def _recover(task: Task, takeovers: Sequence[_Takeover]) -> list[Trajectory]:
     """Drive to the takeovers and let the experts go on; the successful ones."""
     env = BatchEnv(task, len(takeovers))
-    observations = [env.reset([one.driven.context for one in takeovers])]
-    qpos, paths = [env.qpos], [env.paths]
-    actions: list[NDArray[np.float32]] = []
+    recording = Recording(env, [one.driven.context for one in takeovers])
+    step = 0
     while not env.done.all():
-        action = np.zeros((len(takeovers), task.action_dim), np.float32)
+        actions = np.zeros((len(takeovers), task.action_dim), np.float32)
         for i in np.flatnonzero(~env.done).tolist():
-            action[i] = _action(takeovers[i], len(actions), observations[-1][i])
-        actions.append(task.clip(action))
-        observations.append(env.step(actions[-1]))
-        qpos.append(env.qpos)
-        paths.append(env.paths)
-    columns = [np.stack(rows) for rows in (observations, actions, qpos, paths)]
-    outcomes, steps = env.outcomes(), env.steps
-    return [
-        _cut(task, one, [column[one.step :, i] for column in columns], int(steps[i]), outcomes[i])
-        for i, one in enumerate(takeovers)
-        if outcomes[i]["success"] and steps[i] > one.step
+            one = takeovers[i]
+            if step < one.step:
+                actions[i] = one.driven.actions[step]
+            else:
+                actions[i] = task.clip(one.expert.act(recording.observations[i]))
+        recording.step(actions)
+        step += 1
+    infos = [
+        {
+            "seed": one.driven.info["seed"],
+            "checkpoint": one.driven.info["checkpoint"],
+            "expert": one.expert.to_json(),
+            "taken_over_at": one.step,
+        }
+        for one in takeovers
     ]
-
-
-def _action(takeover: _Takeover, step: int, observation: NDArray[np.float32]) -> Any:
-    if step < takeover.step:
-        return takeover.driven.actions[step]
-    return takeover.expert.act(observation)
-
-
-def _cut(
-    task: Task,
-    takeover: _Takeover,
-    columns: Sequence[NDArray[np.float32]],
-    steps: int,
-    outcome: dict[str, Any],
-) -> Trajectory:
-    """The part of an episode of `steps` control steps after the takeover."""
-    driven = takeover.driven.info
-    return recorded_episode(
-        task,
-        columns=columns,
-        length=steps - takeover.step,
-        context=takeover.driven.context,
-        outcome=outcome,
-        info={
-            "seed": driven["seed"],
-            "checkpoint": driven["checkpoint"],
-            "expert": takeover.expert.to_json(),
-            "taken_over_at": takeover.step,
-        },
-    )
+    episodes = recording.episodes(infos, [one.step for one in takeovers])
+    return [one for one in episodes if one.success]
