@@ -58,11 +58,12 @@ class PretrainConfig:
 
         Raises ValueOutOfRangeError for pictures of a task without cameras, and the reverse.
         """
-        if (self.images.cameras if self.images else 0) != len(task.cameras):
+        cameras = self.images.cameras if self.images else 0
+        if cameras != len(task.cameras):
             raise ValueOutOfRangeError(
-                "images",
-                self.images,
-                f"{len(task.cameras)} cameras, as task {task.name.value!r} has",
+                "number of cameras",
+                cameras,
+                f"{len(task.cameras)}, as task {task.name.value!r} has",
             )
         rows = task.observation_dim
         if self.images is not None:

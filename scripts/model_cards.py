@@ -27,7 +27,8 @@ HEAD = """# Shipped policies
 One pretrained policy a task lies in `rodif_core/checkpoints/`. This page is made from these
 files by `.venv/bin/python scripts/model_cards.py`. Brackets are 95 % Wilson intervals;
 *preferred* is the share of the preferred group among successes. *Paper* is the success of the
-paper's own pretrained policy on the task of that name: other demonstrations, other simulation.
+paper's own pretrained policy on the task of that name: other demonstrations, other simulation, and
+Aligning and Stacking seen through cameras only, so a `-state` policy has an easier task than it.
 
 """
 

@@ -72,6 +72,8 @@ AT_REST = 0.0005  # m per control step (17 mm/s)
 
 # The middle of the jaws leaves the workspace where arm or table end.
 WORKSPACE = ((0.20, 0.80), (-0.50, 0.50), (0.005, 0.55))  # m; x, y, z
+# The part of the table that maps show: all starts, the pad, and some room.
+DRAWN = {"x0": 0.28, "y0": -0.33, "x1": 0.70, "y1": 0.28}  # m
 FALLEN = 0.0  # m; a block whose centre is lower has left the table
 
 JOINT_LIMIT = 0.06  # rad per control step
@@ -215,7 +217,7 @@ class StackingStateTask(Task):
                 )
                 for index, (name, (x, y)) in enumerate(RANGES.items())
             ),
-            {"type": "workspace", "x0": 0.28, "y0": -0.33, "x1": 0.70, "y1": 0.28},
+            {"type": "workspace", **DRAWN},
             {"type": "start", "x": START[0], "y": START[1]},
         ]
 
