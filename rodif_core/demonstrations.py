@@ -104,6 +104,15 @@ def assign_modes(task: Task, episodes: int, preferred_share: float) -> list[str]
     return modes
 
 
+def mode_shares(task: Task, preferred_share: float) -> NDArray[np.float64]:
+    """The share of each of the task's modes (modes,) among many demonstrations."""
+    liked = np.array([task.group_of(mode) == task.preferred_group for mode in task.modes])
+    shares = np.where(liked, preferred_share / liked.sum(), 0.0)
+    if not liked.all():
+        shares += np.where(liked, 0.0, (1 - preferred_share) / (~liked).sum())
+    return np.asarray(shares)
+
+
 def _demonstrate(env: BatchEnv, batch: Sequence[_Assignment], seed: int) -> list[Trajectory]:
     """One trajectory an assignment, successful or not."""
     task = env.task

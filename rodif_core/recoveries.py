@@ -13,18 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rodif_core.demonstrations import Recording
+from rodif_core.demonstrations import Recording, mode_shares
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.rollout import rollout
 from rodif_core.spec import RolloutConfig
 from rodif_core.tasks import get_task
-from rodif_core.tasks.base import Task
+from rodif_core.tasks.base import Array, Task
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts import Expert, draw_expert
 from rodif_core.trajectory import Trajectory
 
 PARALLEL = 100  # simulations stepped together
 LATEST = 0.7  # share of the task's time limit after which nobody takes over: too little is left
+TIE = 1e-6  # relative; errors of experts that still do the same differ by rounding only
 RECENT = 40  # control steps before the takeover that tell which mode the policy was after
 
 
@@ -37,34 +38,47 @@ class _Takeover:
     expert: Expert
 
 
-def make_recoveries(checkpoint: Checkpoint, *, episodes: int, seed: int) -> list[Trajectory]:
+def make_recoveries(
+    checkpoint: Checkpoint, *, episodes: int, seed: int, preferred_share: float | None = None
+) -> list[Trajectory]:
     """What experts did after they took over from the policy, where it led to success.
 
     The policy drives `episodes` of them, from seed on; each is driven again up to a step drawn from
     those that it lasted, and the expert goes on from there. Takeovers that it cannot save are left
     out. A trajectory begins at the takeover; its context is that of the whole episode, and
-    info["taken_over_at"] tells the step. Raises ValueOutOfRangeError for values out of range.
+    info["taken_over_at"] tells the step.
+
+    preferred_share  share of the task's preferred group where the policy has not chosen yet, by
+                     default the task's own
+
+    Raises ValueOutOfRangeError for values out of range.
     """
     task = get_task(checkpoint.task)
+    shares = mode_shares(task, task.preferred_share if preferred_share is None else preferred_share)
     driven = rollout(checkpoint, RolloutConfig(episodes=episodes, seed=seed))
     made: list[Trajectory] = []
     for first in range(0, episodes, PARALLEL):
-        made += _recover(task, [_draw(task, one) for one in driven[first : first + PARALLEL]])
+        takeovers = [_draw(task, one, shares) for one in driven[first : first + PARALLEL]]
+        made += _recover(task, takeovers)
     return made
 
 
-def _draw(task: Task, driven: Trajectory) -> _Takeover:
+def _draw(task: Task, driven: Trajectory, shares: Array) -> _Takeover:
     # A stream of its own, apart from the episode's start and the policy's noise.
     rng = np.random.default_rng([driven.info["seed"], 2])
     latest = min(len(driven.actions), int(LATEST * task.max_steps))
     step = int(rng.integers(1, latest)) if latest > 1 else 0
-    return _Takeover(driven, step, _likeliest_expert(task, driven, step, rng))
+    return _Takeover(driven, step, _likeliest_expert(task, driven, step, shares, rng))
 
 
 def _likeliest_expert(
-    task: Task, driven: Trajectory, step: int, rng: np.random.Generator
+    task: Task, driven: Trajectory, step: int, shares: Array, rng: np.random.Generator
 ) -> Expert:
-    """The expert whose actions are nearest to what the policy did before that step."""
+    """The expert whose actions are nearest to what the policy did before that step.
+
+    Where modes have not parted yet several are equally near; one of them is drawn by its share
+    among demonstrations, or the policy would learn modes in other shares.
+    """
     experts = [draw_expert(task.name, mode, driven.context, rng) for mode in task.modes]
     past = slice(max(0, step - RECENT), step)
     seen, done = driven.observations[past], driven.actions[past]
@@ -75,7 +89,9 @@ def _likeliest_expert(
         )
         for expert in experts
     ]
-    return experts[int(np.argmin(errors))]
+    tied = np.array(errors) <= min(errors) * (1 + TIE)
+    weights = np.where(tied, shares + TIE, 0.0)  # also where no demonstration has such a mode
+    return experts[int(rng.choice(len(experts), p=weights / weights.sum()))]
 
 
 def _recover(task: Task, takeovers: Sequence[_Takeover]) -> list[Trajectory]:

@@ -15,6 +15,7 @@ from rodif_core.demonstrations import (
     assign_modes,
     load_demonstrations,
     make_demonstrations,
+    mode_shares,
     save_demonstrations,
 )
 from rodif_core.errors import (
@@ -23,6 +24,7 @@ from rodif_core.errors import (
     UnknownNameError,
     ValueOutOfRangeError,
 )
+from rodif_core.tasks import get_task
 from rodif_core.tasks.avoid import START, AvoidTask
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts.avoid import MIN_CLEARANCE, AvoidExpert
@@ -52,6 +54,15 @@ def test_at_least_95_percent_of_first_draws_succeed_on_both_sides(
         attempts = [one.info["attempt"] for one in balanced if one.outcome["group"] == group]
         assert len(attempts) == 60
         assert attempts.count(0) / len(attempts) >= 0.95
+
+
+@pytest.mark.parametrize("share", [0.0, 0.26, 1.0])
+@pytest.mark.parametrize("name", ["avoid", "stacking-state"])
+def test_mode_shares_are_those_of_many_assignments(name: str, share: float) -> None:
+    task = get_task(name)
+    counts = Counter(assign_modes(task, 10_000, share))
+    counted = [counts[mode] / 10_000 for mode in task.modes]
+    assert mode_shares(task, share) == pytest.approx(counted, abs=1e-3)
 
 
 def test_a_demonstration_is_a_success_with_its_provenance(balanced: list[Trajectory]) -> None:

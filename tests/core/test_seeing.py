@@ -168,7 +168,9 @@ def test_policy_and_task_must_agree_on_cameras(checkpoint: Checkpoint) -> None:
     blind = replace(policy.config, images=None)
     with pytest.raises(ValueOutOfRangeError, match="observation dims of the policy"):
         Sight(TASK, blind, None)
-    with pytest.raises(ValueOutOfRangeError, match="number of cameras is 0, but must be 2, as task 'aligning'"):
+    with pytest.raises(
+        ValueOutOfRangeError, match="number of cameras is 0, but must be 2, as task 'aligning'"
+    ):
         PRESETS[Architecture.MLP]["cpu"].policy_config(TASK)
 
 

@@ -115,7 +115,12 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     for number in range(config.rounds + 1):
         if checkpoint is not None:
             first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
-            shown += make_recoveries(checkpoint, episodes=config.recoveries, seed=first_seed)
+            shown += make_recoveries(
+                checkpoint,
+                episodes=config.recoveries,
+                seed=first_seed,
+                preferred_share=args.preferred_share,
+            )
         training = bar.add_task(f"training {number}", total=config.updates)
 
         def show(done: int, of: int, metrics: dict[str, float], row: TaskID = training) -> None:
