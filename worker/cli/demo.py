@@ -134,11 +134,18 @@ def run(args: argparse.Namespace) -> int:
 
     console = Console()
     signal.signal(signal.SIGTERM, _like_ctrl_c)
+    signal.signal(signal.SIGINT, _like_ctrl_c)  # a shell script's "&" would have it ignored
     password = secrets.token_urlsafe(9)
     started = time.monotonic()
     with running_system(settings, admin_password=password, first_campaign=task) as system:
         begun = time.monotonic() - started
         console.print(f"system ready at {system.url}: {begun:.1f} s", highlight=False)
+        if not args.headless:
+            console.print(
+                f"  to watch it work, sign in as {system.prepared.admin}, password"
+                f" [bold]{password}[/bold]",
+                highlight=False,
+            )
         token = sign_in_as_admin(system, password)
         with Client(system.url, token) as api:
             campaign = api.find_campaign(task.value)

@@ -20,7 +20,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("what", choices=["modes"])
     parser.add_argument(
         "source",
-        help="a .safetensors file, a task: its shipped checkpoint, or a file of `rodif demos`",
+        help="a .safetensors file, a task: its shipped checkpoint, or a .npz file of `rodif demos`"
+        " or `rodif rollout --out`",
     )
     parser.add_argument("--out", type=Path, required=True, help="file to write (png)")
     parser.add_argument("--n", type=int, default=100, help="paths (default %(default)s)")
