@@ -41,7 +41,7 @@ def steering(api: Client, task: TaskName) -> str:
 
 
 def print_result(result: DemoResult, title: str, console: Console) -> None:
-    """The table before and after, and what it took."""
+    """The table before and after, and how long all of it took."""
     from worker.cli.tables import evaluation_table
 
     names = {
@@ -60,8 +60,8 @@ def print_result(result: DemoResult, title: str, console: Console) -> None:
         else f"labels: {labels}",
         highlight=False,
     )
-    stages = ", ".join(f"{name} {seconds:.0f}" for name, seconds in result.seconds.items())
-    console.print(f"seconds: {stages}", highlight=False)
+    minutes, seconds = divmod(round(result.seconds["total"]), 60)
+    console.print(f"all of it took {minutes} min {seconds} s", highlight=False)
 
 
 def sign_in_as_admin(system: System, password: str) -> str:
@@ -176,7 +176,8 @@ def _leave_running(system: System, accounts: Sequence[tuple[str, str]], console:
         accounts, ("rounds, checkpoints, publishing", "label what is left"), strict=True
     ):
         console.print(f"  {name:<10} password [bold]{password}[/bold]   {told}", highlight=False)
-    console.print(f"Data and logs: {system.settings.state_dir}. Ctrl-C stops everything.")
+    console.print(f"Data and logs: {system.settings.state_dir}", soft_wrap=True, highlight=False)
+    console.print("Ctrl-C stops everything.")
     try:
         system.wait()
     except KeyboardInterrupt:

@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
 
     episodes = _episodes(args.source, config)
     task = get_task(str(episodes[0].info["task"]))
-    title = f"{task.name.value}, {len(episodes)} paths of {Path(args.source).name}"
+    origin = "the shipped policy" if args.source == task.name.value else Path(args.source).name
+    title = f"{task.name.value}, {len(episodes)} paths of {origin}"
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_bytes(mode_plot(task, title, episodes))
     print(args.out)

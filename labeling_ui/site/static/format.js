@@ -28,6 +28,8 @@ export function ago(text, now = Date.now()) {
 export const day = (text) =>
   new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
 
-const SPELLINGS = { finetuning: "fine-tuning", finetune: "fine-tune" };
+const SPELLINGS = {
+  finetuning: "fine-tuning", finetune: "fine-tune", bradley_terry: "Bradley–Terry", dawid_skene: "Dawid–Skene",
+};
 export const words = (name) => SPELLINGS[name] ?? String(name ?? "").replaceAll("_", " ");
 export const short = (digest) => String(digest ?? "").slice(0, 10);
