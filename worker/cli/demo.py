@@ -176,8 +176,13 @@ def _leave_running(system: System, accounts: Sequence[tuple[str, str]], console:
         accounts, ("rounds, checkpoints, publishing", "label what is left"), strict=True
     ):
         console.print(f"  {name:<10} password [bold]{password}[/bold]   {told}", highlight=False)
-    console.print(f"Data and logs: {system.settings.state_dir}", soft_wrap=True, highlight=False)
-    console.print("Ctrl-C stops everything.")
+    state = system.settings.state_dir
+    console.print(
+        f"Data and logs: {state}\n"
+        f"Ctrl-C stops everything; rodif up --state {state} opens it again.",
+        soft_wrap=True,
+        highlight=False,
+    )
     try:
         system.wait()
     except KeyboardInterrupt:
