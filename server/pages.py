@@ -174,7 +174,7 @@ def label_page(request: Request, campaign_id: int) -> Response:
 
 @router.get("/admin")
 def admin_index(request: Request) -> Response:
-    """All campaigns, accounts, jobs."""
+    """All campaigns, accounts, tokens."""
     return _page(request, "admin_index.html", admin=True)
 
 
