@@ -6,18 +6,21 @@ Nothing here imports the packages whose files it serves: `find_spec` tells where
 from __future__ import annotations
 
 import hashlib
+from http import HTTPStatus
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from fastapi import APIRouter, FastAPI, Request
-from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Response
+from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.staticfiles import StaticFiles
 from fastapi.templating import Jinja2Templates
 from sqlalchemy import select
 from sqlalchemy.orm import InstrumentedAttribute
+from starlette.exceptions import HTTPException
 
+from server.api import errors
 from server.api.access import COOKIE, Anyone, UseServices, who
 from server.api.services import services_of
 from server.errors import ArtifactError, NotFoundError, NotSignedInError
@@ -60,6 +63,7 @@ def install(app: FastAPI) -> None:
     app.state.templates = Jinja2Templates(directory=site / "templates")
     app.state.ui_version = f"{app.version}+{_fingerprint(site)}"
     app.include_router(router)
+    app.add_exception_handler(HTTPException, _http_error)
     app.mount("/static", _SiteFiles(directory=site / "static", check_dir=False), name="static")
 
 
@@ -119,9 +123,25 @@ def _page(
     with services_of(request).database.read() as session:
         campaign = session.get(Campaign, campaign_id)
     if campaign is None:
-        text = f"<!doctype html><title>Not found</title><p>There is no campaign {campaign_id}."
-        return HTMLResponse(f'{text} <a href="{_home(me)}">Back</a>', status_code=404)
+        return _not_found(request, me, f"There is no campaign {campaign_id}.")
     return _render(request, template, me=me, campaign=campaign)
+
+
+def _not_found(request: Request, me: Me | None, what: str) -> Response:
+    response = _render(request, "not_found.html", me=me, what=what)
+    response.status_code = HTTPStatus.NOT_FOUND
+    return response
+
+
+def _http_error(request: Request, error: Exception) -> Response:
+    """A page for a person who asks for an address that is none; scripts get the usual JSON."""
+    assert isinstance(error, HTTPException)
+    wants_page = request.method == "GET" and "text/html" in request.headers.get("accept", "")
+    if error.status_code != HTTPStatus.NOT_FOUND or request.url.path.startswith("/api/"):
+        wants_page = False
+    if not wants_page:
+        return errors.http_error(request, error)
+    return _not_found(request, _visitor(request), "There is no page at this address.")
 
 
 @router.get("/")
@@ -154,7 +174,7 @@ def label_page(request: Request, campaign_id: int) -> Response:
 
 @router.get("/admin")
 def admin_index(request: Request) -> Response:
-    """All campaigns, accounts, jobs."""
+    """All campaigns, accounts, tokens."""
     return _page(request, "admin_index.html", admin=True)
 
 

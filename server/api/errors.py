@@ -73,7 +73,7 @@ def install(app: FastAPI) -> None:
     app.openapi = openapi  # type: ignore[method-assign]  # the documented way to extend it
     app.add_exception_handler(RodifError, _rodif_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
-    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(HTTPException, http_error)
     app.add_exception_handler(Exception, _unexpected_error)
 
 
@@ -117,7 +117,8 @@ def _validation_error(_request: Request, error: Exception) -> JSONResponse:
     return problem(HTTPStatus.UNPROCESSABLE_ENTITY, fields, errors=found)
 
 
-def _http_error(_request: Request, error: Exception) -> JSONResponse:
+def http_error(_request: Request, error: Exception) -> JSONResponse:
+    """What the framework itself refuses, such as an unknown address."""
     assert isinstance(error, HTTPException)
     headers = dict(error.headers) if error.headers else None
     return problem(error.status_code, str(error.detail), headers=headers)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +14,7 @@ import psutil
 import pytest
 
 from rodif_core import shipped
+from worker.cli.client import Client
 from worker.cli.main import main
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
@@ -78,3 +81,29 @@ def test_demo_refuses_a_folder_in_use(tmp_path: Path):
     )
     assert done.returncode == 1
     assert "wants an empty folder" in done.stderr
+
+
+def test_demo_can_be_watched_from_its_start_and_ctrl_c_ends_all_of_it(tmp_path: Path):
+    state = tmp_path / "state"
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "worker.cli.main", "demo", "--port", "0", "--state", state],
+        env=os.environ | {"RODIF_ARGON2_CHEAP": "true", "COLUMNS": "80", "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert demo.stdout is not None
+    ready, sign_in = (demo.stdout.readline() for _ in range(2))
+    try:
+        url = re.search(r"http://[\d.:]+\d", ready)
+        password = re.search(r"sign in as admin, password (\S+)", sign_in)
+        assert url and password, ready + sign_in
+        with Client(url.group()) as browser:
+            browser.sign_in("admin", password.group(1))
+            assert browser.get("/me")["role"] == "admin"
+    finally:
+        demo.send_signal(signal.SIGINT)
+        demo.communicate(timeout=120)
+    assert demo.returncode == 130
+    left = [p for p in psutil.process_iter(["cmdline"]) if str(state) in str(p.info["cmdline"])]
+    assert left == []

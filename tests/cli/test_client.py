@@ -53,6 +53,7 @@ def test_round_with_an_illegal_gamma_names_the_legal_ones(api: RunningApi):
     with api.admin() as admin, pytest.raises(ApiError, match=r"1\.5.*\[0, 1\)") as caught:
         rounds.launch(admin, campaign["id"], conservativeness=1.5)
     assert caught.value.status == 422
+    assert str(caught.value).count("1.5") == 1, "said once"
 
 
 def test_silent_address_is_named(monkeypatch: pytest.MonkeyPatch):

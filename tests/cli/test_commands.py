@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from labeling_ui.mode_plot import GROUP_COLOURS
 from rodif_core import shipped
@@ -22,6 +24,7 @@ from tests.core.learning import tiny_checkpoint
 from worker.cli import pretrain
 from worker.cli.main import main
 from worker.cli.options import number_list
+from worker.cli.tables import evaluation_table
 
 
 def test_help_loads_no_simulator_and_no_database():
@@ -53,7 +56,10 @@ def test_evaluate_prints_rates_and_intervals_of_a_file(
     assert 0 <= measured["intervals"]["success"][0] <= measured["success"] <= 1
     written = tmp_path / "deep" / "out.json"
     assert main(["evaluate", str(file), "--n", "3", "--seed", "7", "--json", str(written)]) == 0
-    assert "off support" in capsys.readouterr().out
+    table = capsys.readouterr().out
+    assert "off support" in table
+    assert "reasons: 3 × left workspace\n" in table
+    assert "modes: –\n" in table
     assert json.loads(written.read_text()) == measured
     assert {"success", "alignment", "modes", "n", "intervals"} <= set(measured)
 
@@ -73,6 +79,26 @@ def test_evaluate_refuses_what_is_no_checkpoint(
         file.write_bytes(content)
     assert main(["evaluate", str(file)]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_rates_stand_above_their_intervals_where_80_columns_are_too_few_for_both():
+    rate = {"success": 0.5, "alignment": 0.25, "alignment_of_successes": 1.0}
+    evaluation = rate | {"off_support": 0.0, "n": 400, "intervals": {"success": [0.4, 0.6]}}
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(evaluation_table("two", [("after (published)", evaluation)]))
+    (row, below) = [line for line in console.export_text().splitlines() if line.startswith("│")]
+    assert [cell.strip() for cell in row.split("│")[2:4]] == ["50.0 %", "25.0 %"]
+    assert [cell.strip() for cell in below.split("│")[1:4]] == ["", "[40–60]", ""]
+
+
+@pytest.mark.parametrize("command", ["simulate", "round"])
+def test_without_a_token_the_command_says_where_to_get_one(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.delenv("RODIF_TOKEN", raising=False)
+    assert main([command, "--url", "http://127.0.0.1:9"]) == 1
+    error = capsys.readouterr().err
+    assert "sign in at http://127.0.0.1:9 as an admin, make one under Tokens" in error
 
 
 def test_evaluate_names_the_legal_number_of_rollouts(capsys: pytest.CaptureFixture[str]):

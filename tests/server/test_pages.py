@@ -71,7 +71,21 @@ def test_annotators_are_sent_from_admin_pages_to_their_own(sqlite_world: World, 
 def test_a_page_of_an_unknown_campaign_says_so(sqlite_world: World) -> None:
     answer = sqlite_world.signed_in("ann").get("/label/99")
     assert answer.status_code == 404 and "no campaign 99" in answer.text
+    assert 'class="brand"' in answer.text
     assert sqlite_world.signed_in("ann").get("/label/abc").status_code == 404
+
+
+def test_unknown_addresses_answer_people_with_a_page_and_scripts_with_json(
+    sqlite_world: World,
+) -> None:
+    browser = sqlite_world.browser()
+    page = browser.get("/nowhere", headers={"Accept": "text/html,*/*;q=0.8"})
+    assert page.status_code == 404 and "no page at this address" in page.text
+    assert page.headers["content-security-policy"].startswith("default-src 'self'")
+    for path, accepted in (("/nowhere", "*/*"), ("/api/v1/nowhere", "text/html")):
+        answer = browser.get(path, headers={"Accept": accepted})
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert answer.json()["status"] == 404
 
 
 def test_every_file_that_a_page_names_is_served(sqlite_world: World) -> None:

@@ -156,11 +156,10 @@ class Client:
 
 
 def _problem(response: httpx2.Response, what: str) -> str:
-    """The sentence of a problem+json answer, with the fields it names."""
+    """The sentence of a problem+json answer; it names the fields that `errors` lists."""
     try:
         problem = response.json()
     except ValueError:
         problem = {}
     sentence = problem.get("detail") or problem.get("title") or response.reason_phrase
-    fields = "; ".join(str(item) for item in problem.get("errors") or [])
-    return f"{what} → {response.status_code}: {sentence}" + (f" ({fields})" if fields else "")
+    return f"{what} → {response.status_code}: {sentence}"

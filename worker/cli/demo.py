@@ -41,7 +41,7 @@ def steering(api: Client, task: TaskName) -> str:
 
 
 def print_result(result: DemoResult, title: str, console: Console) -> None:
-    """The table before and after, and what it took."""
+    """The table before and after, and how long all of it took."""
     from worker.cli.tables import evaluation_table
 
     names = {
@@ -60,8 +60,8 @@ def print_result(result: DemoResult, title: str, console: Console) -> None:
         else f"labels: {labels}",
         highlight=False,
     )
-    stages = ", ".join(f"{name} {seconds:.0f}" for name, seconds in result.seconds.items())
-    console.print(f"seconds: {stages}", highlight=False)
+    minutes, seconds = divmod(round(result.seconds["total"]), 60)
+    console.print(f"all of it took {minutes} min {seconds} s", highlight=False)
 
 
 def sign_in_as_admin(system: System, password: str) -> str:
@@ -134,11 +134,18 @@ def run(args: argparse.Namespace) -> int:
 
     console = Console()
     signal.signal(signal.SIGTERM, _like_ctrl_c)
+    signal.signal(signal.SIGINT, _like_ctrl_c)  # a shell script's "&" would have it ignored
     password = secrets.token_urlsafe(9)
     started = time.monotonic()
     with running_system(settings, admin_password=password, first_campaign=task) as system:
         begun = time.monotonic() - started
         console.print(f"system ready at {system.url}: {begun:.1f} s", highlight=False)
+        if not args.headless:
+            console.print(
+                f"  to watch it work, sign in as {system.prepared.admin}, password"
+                f" [bold]{password}[/bold]",
+                highlight=False,
+            )
         token = sign_in_as_admin(system, password)
         with Client(system.url, token) as api:
             campaign = api.find_campaign(task.value)
@@ -169,7 +176,13 @@ def _leave_running(system: System, accounts: Sequence[tuple[str, str]], console:
         accounts, ("rounds, checkpoints, publishing", "label what is left"), strict=True
     ):
         console.print(f"  {name:<10} password [bold]{password}[/bold]   {told}", highlight=False)
-    console.print(f"Data and logs: {system.settings.state_dir}. Ctrl-C stops everything.")
+    state = system.settings.state_dir
+    console.print(
+        f"Data and logs: {state}\n"
+        f"Ctrl-C stops everything; rodif up --state {state} opens it again.",
+        soft_wrap=True,
+        highlight=False,
+    )
     try:
         system.wait()
     except KeyboardInterrupt:

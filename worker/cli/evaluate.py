@@ -83,5 +83,7 @@ def run(args: argparse.Namespace) -> int:
     title = f"{checkpoint.task.value}, seeds {args.seed} … {args.seed + args.n - 1}"
     console.print(evaluation_table(title, [(checkpoint.digest[:12], result)]))
     for kind in ("groups", "modes", "reasons"):
-        console.print(f"{kind}: " + ", ".join(f"{k} {v}" for k, v in result[kind].items()))
+        counts = sorted(result[kind].items(), key=lambda item: -item[1])
+        told = ", ".join(f"{count} × {name.replace('_', ' ')}" for name, count in counts)
+        console.print(f"{kind}: {told or '–'}", highlight=False)
     return 0

@@ -6,7 +6,12 @@ import argparse
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from rodif_core.errors import RodifError
+
+if TYPE_CHECKING:
+    from worker.cli.client import Client
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 
@@ -21,9 +26,21 @@ def add_connection_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--token",
         default=os.environ.get("RODIF_TOKEN"),
-        help="bearer token rdf_… (or RODIF_TOKEN)",
+        help="token rdf_… of an admin, made under Tokens on the site (or RODIF_TOKEN)",
     )
     parser.add_argument("--campaign", help="name or number; not needed when there is only one")
+
+
+def connect(args: argparse.Namespace) -> Client:
+    """A client of what `add_connection_arguments` says; raises RodifError without a token."""
+    from worker.cli.client import Client
+
+    if not args.token:
+        raise RodifError(
+            f"a token is needed: sign in at {args.url} as an admin, make one under Tokens, and"
+            " give it with --token or in RODIF_TOKEN"
+        )
+    return Client(args.url, args.token)
 
 
 PRINTED = Path("-")  # --json without a file

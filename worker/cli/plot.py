@@ -20,7 +20,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("what", choices=["modes"])
     parser.add_argument(
         "source",
-        help="a .safetensors file, a task: its shipped checkpoint, or a file of `rodif demos`",
+        help="a .safetensors file, a task: its shipped checkpoint, or a .npz file of `rodif demos`"
+        " or `rodif rollout --out`",
     )
     parser.add_argument("--out", type=Path, required=True, help="file to write (png)")
     parser.add_argument("--n", type=int, default=100, help="paths (default %(default)s)")
@@ -38,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
 
     episodes = _episodes(args.source, config)
     task = get_task(str(episodes[0].info["task"]))
-    title = f"{task.name.value}, {len(episodes)} paths of {Path(args.source).name}"
+    origin = "the shipped policy" if args.source == task.name.value else Path(args.source).name
+    title = f"{task.name.value}, {len(episodes)} paths of {origin}"
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_bytes(mode_plot(task, title, episodes))
     print(args.out)

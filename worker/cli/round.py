@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rodif_core.spec import FinetuneMethod, RolloutConfig
 from server.states import PublishRule
-from worker.cli.options import add_connection_arguments
+from worker.cli.options import add_connection_arguments, connect
 
 if TYPE_CHECKING:
     from worker.cli.client import Client
@@ -81,13 +81,12 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from worker.cli.client import Client
     from worker.cli.tables import evaluation_table
 
     evaluation = None
     if args.episodes is not None:
         evaluation = RolloutConfig(episodes=args.episodes, seed=args.seed)
-    with Client(args.url, args.token) as api:
+    with connect(args) as api:
         started = launch(
             api,
             api.find_campaign(args.campaign)["id"],

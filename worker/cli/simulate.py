@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
-from worker.cli.options import add_connection_arguments
+from worker.cli.options import add_connection_arguments, connect
 
 if TYPE_CHECKING:
     import numpy as np
@@ -267,26 +267,38 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=f"True criterion: {CRITERION}.",
     )
     add_connection_arguments(parser)
-    parser.add_argument("--annotators", type=int, default=5, help="accounts, each in a thread")
     parser.add_argument(
-        "--labels", type=int, default=100, help="preferences to give; 'equal' comes on top"
+        "--annotators", type=int, default=5, help="accounts, each in a thread (default %(default)s)"
     )
-    parser.add_argument("--flip-rate", type=float, default=0.0, help="share flipped, 0 to 1")
+    parser.add_argument(
+        "--labels",
+        type=int,
+        default=100,
+        help="preferences to give; 'equal' comes on top (default %(default)s)",
+    )
+    parser.add_argument(
+        "--flip-rate",
+        type=float,
+        default=0.0,
+        help="share of the preferences that are flipped, 0 to 1 (default %(default)s)",
+    )
     parser.add_argument(
         "--corruption",
         choices=CORRUPTIONS,
         default="exact",
         help="an exact share of the preferences, or each on its own (default %(default)s)",
     )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--name", default="simulated", help="accounts are NAME-1, NAME-2, …")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of the flips and the times (default %(default)s)"
+    )
+    parser.add_argument(
+        "--name", default="simulated", help="accounts are NAME-1, NAME-2, … (default %(default)s)"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Label, then print what was given."""
-    from worker.cli.client import Client
-
     config = SimulationConfig(
         annotators=args.annotators,
         labels=args.labels,
@@ -295,7 +307,7 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
         name=args.name,
     )
-    with Client(args.url, args.token) as admin:
+    with connect(args) as admin:
         report = simulate(admin, admin.find_campaign(args.campaign), config)
     if args.json:
         print(json.dumps(asdict(report)))

@@ -15,10 +15,15 @@ def percent(value: float) -> str:
 
 
 def with_interval(evaluation: Mapping[str, Any], name: str) -> str:
-    """A rate and its 95 % interval, if the evaluation has one."""
+    """A rate and below it its 95 % interval, if the evaluation has one.
+
+    Side by side they are too wide for a terminal of 80 columns, which would break some of them.
+    """
     interval = evaluation.get("intervals", {}).get(name)
     text = percent(evaluation[name])
-    return text if interval is None else f"{text} [{100 * interval[0]:.0f}–{100 * interval[1]:.0f}]"
+    if interval is None:
+        return text
+    return f"{text}\n[{100 * interval[0]:.0f}–{100 * interval[1]:.0f}]"
 
 
 def evaluation_table(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:

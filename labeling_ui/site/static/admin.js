@@ -50,12 +50,18 @@ async function create() {
     return;
   }
   const made = {};
+  // Another task proposes its own criterion, unless somebody has written one.
+  const proposeCriterion = (name, form) => {
+    const { criterion } = form.elements;
+    if (!tasks.some((task) => task.criterion === criterion.value)) return;
+    criterion.value = tasks.find((task) => task.name === name).criterion;
+  };
   const values = await ask({
     title: "New campaign",
     confirm: "Create",
     fields: [
       { name: "name", label: "Name", required: true, placeholder: "Avoid, left side" },
-      { name: "task", label: "Robot task", kind: "select", options: tasks.map((task) => [task.name, words(task.name)]) },
+      { name: "task", label: "Robot task", kind: "select", options: tasks.map((task) => [task.name, words(task.name)]), onChange: proposeCriterion },
       { name: "criterion", label: "What annotators are asked", kind: "textarea", value: tasks[0]?.criterion ?? "", required: true },
       { name: "labels_per_pair", label: "Labels per pair", kind: "number", value: 1, min: 1, max: 20, step: 1, hint: "Two or more let the noise be measured from overlap." },
     ],

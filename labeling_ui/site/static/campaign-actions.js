@@ -1,7 +1,7 @@
 // What the buttons of the campaign page do: ask, call the server, tell, and have the page refreshed.
 
 import { get, post, request } from "./api.js";
-import { ask, describe, element, toast } from "./dom.js";
+import { ask, describe, show, toast } from "./dom.js";
 import { lineageList } from "./panels.js";
 
 const STRATEGIES = [["cross_group", "Different behaviour against each other"], ["random", "Random"]];
@@ -125,15 +125,4 @@ export function campaignActions(id, data, refresh) {
   };
 
   return { collect, startRound, settings, publish, rollBack, cancel, retry, lineage };
-}
-
-function show(title, content) {
-  const dialog = element(
-    "dialog.dialog.broad", { "aria-label": title },
-    element("h2", {}, title), content,
-    element("form.dialog-actions", { method: "dialog" }, element("button.button.primary", {}, "Close")),
-  );
-  dialog.addEventListener("close", () => dialog.remove());
-  document.body.append(dialog);
-  dialog.showModal();
 }

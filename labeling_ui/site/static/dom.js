@@ -57,6 +57,7 @@ export function toast(text, { action = null, onAction = null, bad = false, secon
 
 // A question with optional fields. Resolves to an object of the fields' values, or null.
 //   fields: [{name, label, kind: "text" | "number" | "select" | "textarea", value, options, hint, …}]
+//     onChange: (value, form) => …, of a select
 //   onSubmit: async (values) => …; an error it throws is shown in the dialog, which stays open
 export function ask({ title, text = "", fields = [], confirm = "OK", danger = false, onSubmit }) {
   return new Promise((resolve) => {
@@ -100,6 +101,18 @@ export function ask({ title, text = "", fields = [], confirm = "OK", danger = fa
   });
 }
 
+// Something to read, until it is closed.
+export function show(title, ...content) {
+  const dialog = element(
+    "dialog.dialog.broad", { "aria-label": title },
+    element("h2", {}, title), ...content,
+    element("form.dialog-actions", { method: "dialog" }, element("button.button.primary", {}, "Close")),
+  );
+  dialog.addEventListener("close", () => dialog.remove());
+  document.body.append(dialog);
+  dialog.showModal();
+}
+
 function fieldRow(field) {
   const id = `field-${field.name}`;
   const shared = { id, name: field.name, "aria-describedby": field.hint ? `${id}-hint` : null };
@@ -107,7 +120,8 @@ function fieldRow(field) {
   if (field.kind === "select") {
     const options = field.options.map(([value, label]) =>
       element("option", { value, selected: value === field.value }, label));
-    input = element("select.input", shared, ...options);
+    const onchange = (event) => field.onChange?.(event.target.value, event.target.form);
+    input = element("select.input", { ...shared, onchange }, ...options);
   } else if (field.kind === "textarea") {
     input = element("textarea.input", { ...shared, rows: 3, required: field.required }, field.value ?? "");
   } else {

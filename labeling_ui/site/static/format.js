@@ -22,9 +22,14 @@ export function ago(text, now = Date.now()) {
   if (seconds < 45) return "just now";
   if (seconds < 3600) return `${Math.round(seconds / 60)} min ago`;
   if (seconds < 86_400) return `${Math.round(seconds / 3600)} h ago`;
-  return new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
+  return day(text);
 }
 
-const SPELLINGS = { finetuning: "fine-tuning", finetune: "fine-tune" };
+export const day = (text) =>
+  new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
+
+const SPELLINGS = {
+  finetuning: "fine-tuning", finetune: "fine-tune", bradley_terry: "Bradley–Terry", dawid_skene: "Dawid–Skene",
+};
 export const words = (name) => SPELLINGS[name] ?? String(name ?? "").replaceAll("_", " ");
 export const short = (digest) => String(digest ?? "").slice(0, 10);

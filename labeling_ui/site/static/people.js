@@ -4,6 +4,7 @@ import { get, post, request } from "./api.js";
 import { ask, element, find, replace, toast } from "./dom.js";
 import { count } from "./format.js";
 import { table } from "./panels.js";
+import { addToken, drawTokens } from "./tokens.js";
 
 const ROLES = [["annotator", "Annotator: labels"], ["admin", "Admin: everything"], ["service", "Service: scripts"]];
 const PASSWORD_HINT = "At least 8 characters. Tell it to the person yourself.";
@@ -12,6 +13,8 @@ export async function drawPeople() {
   const people = await get("/annotators");
   const heads = [["Name"], ["Role"], ["Labels", "number"], [""]];
   replace(find("#people"), table(heads, people.map(row), "Nobody."));
+  find("#new-token").onclick = () => addToken(people);
+  await drawTokens(people);
 }
 
 function row(person) {

@@ -1,0 +1,68 @@
+"""The page of campaigns, people and tokens in a real Chromium."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+from playwright.sync_api import Page
+
+from server.bootstrap import register_checkpoint
+from tests.ui.driving import sign_in
+from tests.ui.studio import Studio, task_facts
+from worker.cli.client import ApiError, Client
+
+pytestmark = pytest.mark.browser
+
+
+def test_token_made_on_the_page_opens_the_api_until_it_is_revoked(
+    studio: Studio, page: Page
+) -> None:
+    sign_in(page, studio, "admin", "/admin")
+    name = studio.new_name("script")
+    page.get_by_role("button", name="New token").click()
+    page.get_by_label("What it is for").fill(name)
+    page.get_by_role("button", name="Make token").click()
+    shown = page.get_by_role("dialog", name=f"Token “{name}”")
+    token = shown.locator("code").inner_text()
+    with Client(studio.url, token) as api:
+        assert api.get("/me")["name"] == "admin"
+        shown.get_by_role("button", name="Close").click()
+        shown.wait_for(state="detached")
+        row = page.locator("#tokens tr", has_text=name)
+        assert token not in page.content(), "the secret is shown once"
+        row.get_by_role("button", name="Revoke").click()
+        page.get_by_role("dialog").get_by_role("button", name="Revoke").click()
+        row.wait_for(state="detached")
+        with pytest.raises(ApiError) as refused:
+            api.get("/me")
+    assert refused.value.status == 401
+
+
+def test_another_task_proposes_its_own_criterion_unless_one_was_written(
+    studio: Studio, page: Page
+) -> None:
+    with studio.database.write() as session:
+        register_checkpoint(
+            session,
+            datetime.now(UTC),
+            studio.artifacts,
+            task="pushing",
+            name="pushing-pretrained",
+            blob=b"other weights",
+            digest="2" * 64,
+            config={"task_facts": task_facts() | {"criterion": "Red to red first."}},
+            metrics={},
+            code_version="test",
+        )
+    sign_in(page, studio, "admin", "/admin")
+    page.get_by_role("button", name="New campaign").click()
+    dialog = page.get_by_role("dialog", name="New campaign")
+    criterion = dialog.get_by_label("What annotators are asked")
+    dialog.get_by_label("Robot task").select_option("pushing")
+    assert criterion.input_value() == "Red to red first."
+    dialog.get_by_label("Robot task").select_option("avoid")
+    assert "cylinder" in criterion.input_value()
+    criterion.fill("My own words.")
+    dialog.get_by_label("Robot task").select_option("pushing")
+    assert criterion.input_value() == "My own words."
