@@ -69,6 +69,20 @@ def test_each_annotator_labels_with_an_account_of_its_own(api: RunningApi):
     assert {label.source for label, _, _ in rows_of(api, campaign)} == {"simulated"}
 
 
+def test_tokens_are_revoked_when_all_is_labelled_and_when_it_fails(api: RunningApi):
+    campaign = api.make_campaign(OUTCOMES, "tokens")
+    run(api, campaign, annotators=3, labels=6, name="token")
+    with api.admin() as admin:
+        person = {"name": "token-4", "role": "annotator", "kind": "person"}
+        admin.post("/annotators", person | {"password": "long enough"})
+        with pytest.raises(RodifError, match="'token-4' is a person"):
+            simulate(admin, campaign, SimulationConfig(name="token", annotators=4))
+        mine = {a["id"] for a in admin.get("/annotators") if a["name"][:6] == "token-"}
+        tokens = [token for token in admin.get("/tokens") if token["annotator_id"] in mine]
+    assert len(tokens) == 6
+    assert all(token["revoked_at"] for token in tokens)
+
+
 def test_no_pair_is_labelled_twice_and_a_second_call_gives_the_rest(api: RunningApi):
     campaign = api.make_campaign(OUTCOMES, "the rest")
     first = run(api, campaign, annotators=2, labels=25, seed=3)

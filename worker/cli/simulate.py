@@ -20,8 +20,9 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -107,8 +108,7 @@ def simulate(
     tickets: queue.SimpleQueue[bool] = queue.SimpleQueue()
     for flip in draw(labels, config.flip_rate, rng):
         tickets.put(bool(flip))
-    tokens = annotator_tokens(admin, config)
-    with ThreadPoolExecutor(len(tokens)) as pool:
+    with annotator_tokens(admin, config) as tokens, ThreadPoolExecutor(len(tokens)) as pool:
         runs = [
             pool.submit(_label_until_done, admin.url, token, campaign, truth, tickets, stream)
             for token, stream in zip(tokens, rng.spawn(len(tokens)), strict=True)
@@ -169,24 +169,30 @@ class TrueChoices:
         )
 
 
-def annotator_tokens(admin: Client, config: SimulationConfig) -> list[str]:
-    """A bearer token for each simulated annotator; accounts are made when they do not exist."""
+@contextmanager
+def annotator_tokens(admin: Client, config: SimulationConfig) -> Iterator[list[str]]:
+    """A bearer token for each simulated annotator, revoked afterwards; accounts are made when they
+    do not exist."""
     accounts = {account["name"]: account for account in admin.get("/annotators")}
-    tokens = []
-    for number in range(1, config.annotators + 1):
-        name = f"{config.name}-{number}"
-        account = accounts.get(name)
-        if account is None:
-            account = admin.post(
-                "/annotators", {"name": name, "role": "service", "kind": "simulated"}
-            )
-        if account["kind"] != "simulated":
-            raise RodifError(
-                f"account {name!r} is a {account['kind']}, not simulated; choose another --name"
-            )
-        asked = {"annotator_id": account["id"], "name": "simulate", "days": 1}
-        tokens.append(admin.post("/tokens", asked)["token"])
-    return tokens
+    issued = []
+    try:
+        for number in range(1, config.annotators + 1):
+            name = f"{config.name}-{number}"
+            account = accounts.get(name)
+            if account is None:
+                account = admin.post(
+                    "/annotators", {"name": name, "role": "service", "kind": "simulated"}
+                )
+            if account["kind"] != "simulated":
+                raise RodifError(
+                    f"account {name!r} is a {account['kind']}, not simulated; choose another --name"
+                )
+            asked = {"annotator_id": account["id"], "name": "simulate", "days": 1}
+            issued.append(admin.post("/tokens", asked))
+        yield [token["token"] for token in issued]
+    finally:
+        for token in issued:
+            admin.request("DELETE", f"/tokens/{token['id']}")
 
 
 def _label_until_done(
