@@ -6,6 +6,7 @@ Legend: B rows, K denoising steps, To observation history, Tp predicted and Te e
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -32,6 +33,7 @@ from rodif_core.training_state import (
     Precision,
     Progress,
     check_device,
+    claim_workspace,
     cosine_rate,
     forward_precision,
     load_state,
@@ -88,10 +90,22 @@ def pretrain(
     precision  of the forward passes; by default mixed on a GPU
 
     The result holds the averaged weights, the normaliser and the support set. Raises
-    LearningError when the loss is not finite and UnknownNameError for a device that is not there.
+    LearningError when the loss is not finite or the workspace belongs to another training, and
+    UnknownNameError for a device that is not there.
     """
     check_device(device)
     precision = precision or usual_precision(device)
+    if workspace is not None:
+        claim_workspace(
+            workspace,
+            {
+                "task": task_name.value,
+                "demonstrations": _fingerprint(demonstrations),
+                "start": None if start is None else start.digest,
+                "precision": precision.value,
+                **asdict(config),
+            },
+        )
     task = get_task(task_name)
     held_out_count = max(1, int(len(demonstrations) * config.held_out))
     order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
@@ -130,6 +144,13 @@ def pretrain(
         "encoder_curve": encoder_curve,
     }
     return Checkpoint(task_name, trained, _support(known, held_out, trained), card)
+
+
+def _fingerprint(demonstrations: Sequence[Trajectory]) -> str:
+    digest = hashlib.sha256()
+    for one in demonstrations:
+        digest.update(one.observations.tobytes() + one.actions.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _support(

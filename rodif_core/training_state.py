@@ -19,7 +19,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
-from rodif_core.errors import UnknownNameError
+from rodif_core.errors import LearningError, UnknownNameError
 
 Progress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
 
@@ -57,6 +57,34 @@ def cosine_rate(update: int, warm_up: int, updates: int) -> float:
         return (update + 1) / warm_up
     fraction = (update - warm_up) / max(1, updates - warm_up)
     return 0.5 * (1 + math.cos(math.pi * fraction))
+
+
+def claim_workspace(workspace: Path, training: dict[str, Any]) -> None:
+    """Note in a folder which training its partial states belong to, before the first is there.
+
+    training  what decides the result, in JSON types
+
+    Raises LearningError when the folder belongs to another training: going on from its states
+    would give a policy that no command makes.
+    """
+    workspace.mkdir(parents=True, exist_ok=True)
+    file = workspace / "training.json"
+    here = json.loads(json.dumps(training))
+    if not file.exists():
+        temporary = file.with_suffix(".partial")
+        temporary.write_text(json.dumps(here, indent=1, sort_keys=True))
+        os.replace(temporary, file)
+    there = json.loads(file.read_text())
+    differing = [
+        f"{name} is {there.get(name)!r} there and {here.get(name)!r} here"
+        for name in sorted(there.keys() | here.keys())
+        if there.get(name) != here.get(name)
+    ]
+    if differing:
+        raise LearningError(
+            f"{workspace} holds the partial state of another training: {'; '.join(differing)}. "
+            "Give another folder, or delete it to begin anew"
+        )
 
 
 def save_state(

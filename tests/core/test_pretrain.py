@@ -11,7 +11,7 @@ import torch
 
 from rodif_core import pretrain as module
 from rodif_core.demonstrations import make_demonstrations
-from rodif_core.errors import UnknownNameError
+from rodif_core.errors import LearningError, UnknownNameError
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import PolicyConfig, build_denoiser
 from rodif_core.policies.unet import UnetSize
@@ -175,3 +175,16 @@ def test_killed_pretraining_goes_on_to_the_same_weights(
     resumed = pretrain(TaskName.AVOID, demonstrations, CONFIG, workspace=tmp_path)
     whole = pretrain(TaskName.AVOID, demonstrations, CONFIG)
     assert resumed.digest == whole.digest
+
+
+def test_a_workspace_of_another_training_is_refused_and_kept(
+    demonstrations: list[Trajectory], tmp_path: Path
+) -> None:
+    pretrain(TaskName.AVOID, demonstrations, CONFIG, workspace=tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    longer = replace(CONFIG, updates=31)
+    with pytest.raises(LearningError, match="updates is 30 there and 31 here"):
+        pretrain(TaskName.AVOID, demonstrations, longer, workspace=tmp_path)
+    with pytest.raises(LearningError, match="demonstrations is"):
+        pretrain(TaskName.AVOID, demonstrations[:-1], CONFIG, workspace=tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
