@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 ALIGNMENT_GAIN, GAP_SHARE = 0.30, 0.4
 MEASURES = ("success", "alignment", "alignment_of_successes", "off_support", "n", "intervals")
 COMPARED = (FinetuneMethod.RODIF, FinetuneMethod.DP_DPO)
-PATIENCE_SECONDS = 1800.0  # for one stage
+# For one stage. Work that fails says so at once; this only ends a demo that hangs, and must not end
+# one on a slow or busy machine, where a round of a hard task takes the better part of an hour.
+PATIENCE_SECONDS = 4 * 3600.0
 Say = Callable[[str], None]
 
 
