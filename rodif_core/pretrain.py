@@ -95,22 +95,15 @@ def pretrain(
     """
     check_device(device)
     precision = precision or usual_precision(device)
+    basis = {
+        "precision": precision.value,
+        "start": None if start is None else start.digest,
+    }
     if workspace is not None:
-        claim_workspace(
-            workspace,
-            {
-                "task": task_name.value,
-                "demonstrations": _fingerprint(demonstrations),
-                "start": None if start is None else start.digest,
-                "precision": precision.value,
-                **asdict(config),
-            },
-        )
+        shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
+        claim_workspace(workspace, basis | shown | asdict(config))
     task = get_task(task_name)
-    held_out_count = max(1, int(len(demonstrations) * config.held_out))
-    order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
-    held_out = [demonstrations[i] for i in order[:held_out_count]]
-    known = [demonstrations[i] for i in order[held_out_count:]]
+    known, held_out = _split(demonstrations, config)
     encoder, encoder_curve = start.policy.encoder if start is not None else None, None
     if config.images is not None and encoder is None:
         encoder, encoder_curve = train_encoder(
@@ -137,13 +130,22 @@ def pretrain(
         "architecture": shape.architecture.value,
         "preset": asdict(config),
         "device": device,
-        "precision": precision.value,
-        "start": None if start is None else start.digest,
+        **basis,
         "demonstrations": len(demonstrations),
         "held_out_curve": curve,
         "encoder_curve": encoder_curve,
     }
     return Checkpoint(task_name, trained, _support(known, held_out, trained), card)
+
+
+def _split(
+    demonstrations: Sequence[Trajectory], config: PretrainConfig
+) -> tuple[list[Trajectory], list[Trajectory]]:
+    """Those to train on, and those that are held out."""
+    count = max(1, int(len(demonstrations) * config.held_out))
+    order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
+    shuffled = [demonstrations[i] for i in order]
+    return shuffled[count:], shuffled[:count]
 
 
 def _fingerprint(demonstrations: Sequence[Trajectory]) -> str:
