@@ -95,16 +95,13 @@ def pretrain(
     """
     check_device(device)
     precision = precision or usual_precision(device)
-    basis = {
-        "precision": precision.value,
-        "start": None if start is None else start.digest,
-    }
+    basis = {"device": device, "precision": precision.value, "start": start and start.digest}
     if workspace is not None:
         shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
         claim_workspace(workspace, basis | shown | asdict(config))
     task = get_task(task_name)
     known, held_out = _split(demonstrations, config)
-    encoder, encoder_curve = start.policy.encoder if start is not None else None, None
+    encoder, encoder_curve = start.policy.encoder if start else None, None
     if config.images is not None and encoder is None:
         encoder, encoder_curve = train_encoder(
             task, known, held_out, config.images, config.encoder,
@@ -112,30 +109,29 @@ def pretrain(
             progress=progress,
         )  # fmt: skip
     shape = config.policy_config(task) if start is None else start.policy.config
-    seen = encode(task, shape, encoder, known)
+    seen, unseen = (encode(task, shape, encoder, part) for part in (known, held_out))
     policy = _fresh(shape, seen, encoder, config) if start is None else start.policy.copy()
     average, curve = _train(
         policy,
         Windows.cut(seen, shape, policy.normaliser),
-        Windows.cut(encode(task, shape, encoder, held_out), shape, policy.normaliser),
+        Windows.cut(unseen, shape, policy.normaliser),
         config if start is None else replace(config, updates=config.round_updates),
         workspace,
         device,
         precision,
         progress,
     )
-    trained = replace(policy, denoiser=average)
+    policy = replace(policy, denoiser=average)
     card = {
         "kind": "pretrained",
         "architecture": shape.architecture.value,
         "preset": asdict(config),
-        "device": device,
         **basis,
         "demonstrations": len(demonstrations),
         "held_out_curve": curve,
         "encoder_curve": encoder_curve,
     }
-    return Checkpoint(task_name, trained, _support(known, held_out, trained), card)
+    return Checkpoint(task_name, policy, _support(known, held_out, policy), card)
 
 
 def _split(
