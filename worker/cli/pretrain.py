@@ -121,7 +121,8 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
                 seed=first_seed,
                 preferred_share=args.preferred_share,
             )
-        training = bar.add_task(f"training {number}", total=config.updates)
+        updates = config.round_updates if number else config.updates
+        training = bar.add_task(f"training {number}", total=updates)
 
         def show(done: int, of: int, metrics: dict[str, float], row: TaskID = training) -> None:
             shown = {name: value for name, value in metrics.items() if name != "update"}
@@ -143,6 +144,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             precision=Precision(args.precision) if args.precision else None,
             progress=show,
         )
+        bar.update(training, total=updates, completed=updates)  # also one that was done before
     assert checkpoint is not None
     facts = {"rounds": config.rounds, "recoveries": len(shown) - args.demonstrations}
     return replace(checkpoint, card=checkpoint.card | facts)
