@@ -11,13 +11,23 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labeling_ui.scene import Array, Poses, Shape, body_poses, hit_geom, scene_model, smooth
+from labeling_ui.scene import (
+    Poses,
+    SceneModel,
+    Shape,
+    body_poses,
+    hit_geom,
+    relative,
+    scene_model,
+    smooth,
+)
 from labeling_ui.thumbnail import make_thumbnail
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.tasks.base import Task
@@ -30,7 +40,8 @@ __all__ = ["make_replay", "make_thumbnail"]
 
 SIDE_OFFSET = 0.48  # m; A's robot stands this far to the left of the middle, B's to the right
 MIDDLE_X = 0.38  # m in the robot's frame; what lies between the base and the far end of the reach
-SUBFRAMES = 2  # drawn frames per control step: 57 Hz, because the client does not interpolate
+LEAST_RATE = 30.0  # drawn frames per second, because the client does not interpolate
+TRAIL_PIECES = 250  # that appear one by one, at most; each is a thing to draw
 HOLD = 1.2  # s; the last frame stays this long before the client starts again
 
 # Sky blue and orange stay apart for every common kind of colour blindness (Okabe & Ito 2008).
@@ -52,7 +63,7 @@ class _Side:
 
     name: str
     origin: tuple[float, float, float]  # of the robot's frame, m
-    poses: Poses
+    poses: Poses  # seen from each body's parent
     path: NDArray[np.float32]  # (N + 1, 3), m
     hit: int | None  # geom that ended the episode
 
@@ -87,19 +98,26 @@ def make_replay(task: Task, left: Trajectory, right: Trajectory) -> bytes:
             server.stop()
 
 
+def subframes(task: Task) -> int:
+    """Drawn frames per control step: as few as give `LEAST_RATE`."""
+    return math.ceil(LEAST_RATE * task.control_dt)
+
+
 def _side(name: str, x: float, task: Task, trajectory: Trajectory) -> _Side:
-    poses = smooth(body_poses(scene_model(task).model, trajectory.qpos), SUBFRAMES)
+    model = scene_model(task).model
+    poses = relative(body_poses(model, trajectory.qpos), model.body_parentid)
+    poses = smooth(poses, subframes(task))
     return _Side(name, (x, 0.0, 0.0), poses, trajectory.paths, hit_geom(task, trajectory))
 
 
 def _record(server: viser.ViserServer, task: Task, sides: tuple[_Side, _Side]) -> bytes:
     scene = server.scene
     _set_stage(server)
-    tracks = [_Track(scene, side, scene_model(task).shapes) for side in sides]
+    tracks = [_Track(scene, side, scene_model(task), subframes(task)) for side in sides]
     for track in tracks:
         track.show(0)
     recording = server.get_scene_serializer()
-    step = task.control_dt / SUBFRAMES
+    step = task.control_dt / subframes(task)
     for frame in range(1, max(len(side.poses) for side in sides)):
         recording.insert_sleep(step)
         for track in tracks:
@@ -135,19 +153,21 @@ def _set_stage(server: viser.ViserServer) -> None:
 class _Track:
     """The nodes of one side, and what must be sent to show a frame."""
 
-    def __init__(self, scene: Any, side: _Side, shapes: tuple[Shape, ...]) -> None:
+    def __init__(self, scene: Any, side: _Side, drawn: SceneModel, subframes: int) -> None:
         self._side = side
+        self._subframes = subframes
         root = f"/{side.name}"
         scene.add_frame(root, show_axes=False, position=side.origin)
-        self._bodies: dict[int, Any] = {}
-        for shape in shapes:
-            if shape.body not in self._bodies:
-                self._bodies[shape.body] = scene.add_frame(f"{root}/b{shape.body}", show_axes=False)
-            _add_shape(scene, f"{root}/b{shape.body}/g{shape.geom}", shape)
+        self._names = _body_names(root, drawn.model.body_parentid)
+        self._bodies = [scene.add_frame(name, show_axes=False) for name in self._names]
+        for shape in drawn.shapes:
+            _add_shape(scene, f"{self._names[shape.body]}/g{shape.geom}", shape)
         self._add_surroundings(scene, root)
         self._trail = self._add_trail(scene, root)
-        self._hit = _add_hit(scene, root, shapes, side.hit)
-        self._shown: dict[int, tuple[Array, Array]] = {}  # position and wxyz of each body
+        self._hit = self._add_hit(scene, drawn.shapes)
+        # viser compares at some cost; what stays as it was is not even offered to it.
+        self._moved = _changes(side.poses.positions)
+        self._turned = _changes(side.poses.wxyz)
 
     def _add_surroundings(self, scene: Any, root: str) -> None:
         """A tinted mat under the work space and the side's letter in front of it."""
@@ -173,37 +193,63 @@ class _Track:
         scene.add_line_segments(
             f"{root}/path", below, _mix(colour, PALE), thickness=2.0, thickness_units="screen"
         )
+        self._stride = max(1, math.ceil(len(pieces) / TRAIL_PIECES))  # control steps a piece
         return [
             scene.add_line_segments(
-                f"{root}/trail/{index}",
-                pieces[index : index + 1],
+                f"{root}/trail/{first}",
+                pieces[first : first + self._stride],
                 colour,
                 thickness=5.0,
                 thickness_units="screen",
                 visible=False,
             )
-            for index in range(len(pieces))
+            for first in range(0, len(pieces), self._stride)
         ]
+
+    def _add_hit(self, scene: Any, shapes: tuple[Shape, ...]) -> list[Any]:
+        """What appears when the rod has touched an object: the object in another colour."""
+        for shape in shapes:
+            if shape.geom == self._side.hit:
+                name = f"{self._names[shape.body]}/touched"
+                body = _add_shape(scene, name, shape, colour=HIT_COLOUR, grown=1.02, visible=False)
+                above = shape.position + np.array([0.0, 0.0, shape.size[-1] + 0.06])
+                label = scene.add_label(
+                    f"{name}_label", "touched", position=above, font_screen_scale=1.1, visible=False
+                )
+                return [body, label]
+        return []
 
     def show(self, frame: int) -> None:
         """Send what changes at `frame`; frames after the last one change nothing."""
         poses = self._side.poses
         if frame >= len(poses):
             return
-        for body, handle in self._bodies.items():
-            # viser compares at some cost; what stays is not even offered to it.
-            before = self._shown.get(body)
-            position, wxyz = poses.positions[frame, body], poses.wxyz[frame, body]
-            if before is None or not np.array_equal(before[0], position):
-                handle.position = position
-            if before is None or not np.array_equal(before[1], wxyz):
-                handle.wxyz = wxyz
-            self._shown[body] = position, wxyz
-        if frame and frame % SUBFRAMES == 0:
-            self._trail[frame // SUBFRAMES - 1].visible = True
-        if frame == len(poses) - 1:
+        for body in np.flatnonzero(self._moved[frame]):
+            self._bodies[body].position = poses.positions[frame, body]
+        for body in np.flatnonzero(self._turned[frame]):
+            self._bodies[body].wxyz = poses.wxyz[frame, body]
+        last = frame == len(poses) - 1
+        step, between = divmod(frame, self._subframes)
+        if frame and not between and (step % self._stride == 0 or last):
+            self._trail[(step - 1) // self._stride].visible = True
+        if last:
             for handle in self._hit:
                 handle.visible = True
+
+
+def _body_names(root: str, parents: NDArray[np.int32]) -> list[str]:
+    """The node of each body, under that of its parent; what hangs on the world is under `root`."""
+    names = [f"{root}/b0"]
+    for body, parent in enumerate(parents[1:], start=1):
+        names.append(f"{names[parent] if parent else root}/b{body}")
+    return names
+
+
+def _changes(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which bodies' rows of (F, B, D) differ from the frame before (F, B); the first all do."""
+    changes = np.ones(values.shape[:2], dtype=bool)
+    changes[1:] = (values[1:] != values[:-1]).any(axis=2)
+    return changes
 
 
 def _add_shape(
@@ -236,24 +282,6 @@ def _add_shape(
             name, radius=grown * radius, height=2 * grown * half, radial_segments=40, **place
         )
     return scene.add_mesh_simple(name, shape.vertices, shape.faces, scale=grown, **place)
-
-
-def _add_hit(scene: Any, root: str, shapes: tuple[Shape, ...], hit: int | None) -> list[Any]:
-    """What appears when the rod has touched an object: the object in another colour."""
-    for shape in shapes:
-        if shape.geom == hit:
-            name = f"{root}/b{shape.body}/touched"
-            body = _add_shape(scene, name, shape, colour=HIT_COLOUR, grown=1.02, visible=False)
-            above = shape.position + np.array([0.0, 0.0, shape.size[-1] + 0.06])
-            label = scene.add_label(
-                f"{root}/b{shape.body}/touched_label",
-                "touched",
-                position=above,
-                font_screen_scale=1.1,
-                visible=False,
-            )
-            return [body, label]
-    return []
 
 
 def _mix(colour: tuple[int, int, int], white: float) -> tuple[int, int, int]:

@@ -51,7 +51,8 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """World poses of all bodies over F frames: positions (F, B, 3), wxyz (F, B, 4)."""
+    """Poses of all bodies over F frames, in the world's frame or in that of the body's parent:
+    positions (F, B, 3), wxyz (F, B, 4)."""
 
     positions: Array
     wxyz: Array
@@ -77,7 +78,7 @@ def scene_model(task: Task) -> SceneModel:
 
 
 def body_poses(model: mujoco.MjModel, qpos: NDArray[np.float32]) -> Poses:
-    """Poses of all bodies for physics positions `qpos` (F, Q)."""
+    """World poses of all bodies for physics positions `qpos` (F, Q)."""
     data = mujoco.MjData(model)
     positions = np.zeros((len(qpos), model.nbody, 3))
     wxyz = np.zeros((len(qpos), model.nbody, 4))
@@ -86,6 +87,27 @@ def body_poses(model: mujoco.MjModel, qpos: NDArray[np.float32]) -> Poses:
         mujoco.mj_kinematics(model, data)
         positions[frame], wxyz[frame] = data.xpos, data.xquat
     return Poses(positions, wxyz)
+
+
+def relative(poses: Poses, parents: NDArray[np.int32]) -> Poses:
+    """World poses as poses in the frame of each body's parent; `parents` (B,), the world's is 0.
+
+    Most of an arm's parts turn about a joint that stays where it is in the parent: seen from there
+    their positions never change.
+    """
+    back = poses.wxyz[:, parents] * np.array([1.0, -1.0, -1.0, -1.0])
+    offsets = poses.positions - poses.positions[:, parents]
+    pure = np.concatenate([np.zeros_like(offsets[..., :1]), offsets], axis=2)
+    seen = _product(_product(back, pure), poses.wxyz[:, parents])
+    return Poses(seen[..., 1:], _product(back, poses.wxyz))
+
+
+def _product(first: Array, second: Array) -> Array:
+    """Hamilton product of quaternions (…, 4)."""
+    w, v = first[..., :1], first[..., 1:]
+    w2, v2 = second[..., :1], second[..., 1:]
+    scalar = w * w2 - (v * v2).sum(axis=-1, keepdims=True)
+    return np.concatenate([scalar, w * v2 + w2 * v + np.cross(v, v2)], axis=-1)
 
 
 def smooth(poses: Poses, subframes: int) -> Poses:

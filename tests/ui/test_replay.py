@@ -15,9 +15,25 @@ import pytest
 import zstandard
 from PIL import Image
 
-from labeling_ui.replay import HOLD, SIDE_COLOURS, SUBFRAMES, make_replay, make_thumbnail
-from labeling_ui.scene import Poses, hit_geom, merge_vertices, scene_model, smooth
+from labeling_ui.replay import (
+    HOLD,
+    SIDE_COLOURS,
+    TRAIL_PIECES,
+    make_replay,
+    make_thumbnail,
+    subframes,
+)
+from labeling_ui.scene import (
+    Poses,
+    body_poses,
+    hit_geom,
+    merge_vertices,
+    relative,
+    scene_model,
+    smooth,
+)
 from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.spec import TaskName
 from rodif_core.tasks import get_task
 from tests.ui.studio import TASK, episodes, replay_of
 
@@ -66,22 +82,52 @@ def test_recording_tells_nothing_about_policies_modes_or_outcomes() -> None:
     assert labels == ["A", "B"]
 
 
-def test_body_poses_are_those_of_the_recorded_joint_positions() -> None:
+def test_nested_nodes_put_every_body_where_the_recorded_joint_positions_do() -> None:
     run = episodes()[LEFT]
     model = scene_model(TASK_OBJECT).model
     data = mujoco.MjData(model)
     step = 20
     data.qpos[:] = run.qpos[step]
     mujoco.mj_kinematics(model, data)
-    body = model.body("panda0_link7").id
-    time = step * TASK_OBJECT.control_dt
-    found = [
-        m["position"]
-        for t, m in messages(replay_of(LEFT, RIGHT)[0], "SetPositionMessage")
-        if m["name"] == f"/A/b{body}" and t == pytest.approx(time)
+    hand = model.body("panda0_link7").id
+    chain = [hand]
+    while model.body_parentid[chain[0]]:
+        chain.insert(0, int(model.body_parentid[chain[0]]))
+    position, rotation = np.zeros(3), np.eye(3)
+    for depth in range(len(chain)):
+        name = "/A" + "".join(f"/b{body}" for body in chain[: depth + 1])
+        offset = _latest("SetPositionMessage", name, "position", step * TASK_OBJECT.control_dt)
+        wxyz = _latest("SetOrientationMessage", name, "wxyz", step * TASK_OBJECT.control_dt)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, np.array(wxyz) / np.linalg.norm(wxyz))
+        position = position + rotation @ np.array(offset)
+        rotation = rotation @ turn.reshape(3, 3)
+    np.testing.assert_allclose(position, data.xpos[hand], atol=5e-4)
+
+
+def _latest(kind: str, name: str, field: str, time: float) -> list[float]:
+    """What a node was last told of that field, by that time; nothing is sent for no change."""
+    told = [[0.0, 0.0, 0.0] if field == "position" else [1.0, 0.0, 0.0, 0.0]] + [
+        m[field]
+        for t, m in messages(replay_of(LEFT, RIGHT)[0], kind)
+        if m["name"] == name and t <= time + 1e-6
     ]
-    assert len(found) == 1
-    np.testing.assert_allclose(found[0], data.xpos[body], atol=1e-4)
+    value: list[float] = told[-1]
+    return value
+
+
+def test_relative_poses_of_an_arm_turn_and_do_not_move() -> None:
+    run = episodes()[LEFT]
+    model = scene_model(TASK_OBJECT).model
+    seen = smooth(relative(body_poses(model, run.qpos), model.body_parentid), 2)
+    link = model.body("panda0_link7").id
+    assert len(np.unique(seen.positions[:, link], axis=0)) == 1
+    assert len(np.unique(seen.wxyz[:, link], axis=0)) > len(run.qpos) / 2
+
+
+def test_drawn_frames_are_as_few_as_look_smooth() -> None:
+    rates = {name: subframes(get_task(name)) / get_task(name).control_dt for name in TaskName}
+    assert all(30 <= rate < 60 for rate in rates.values()), rates
 
 
 def test_a_stands_left_of_b_and_both_show_the_same_scene() -> None:
@@ -123,6 +169,26 @@ def test_hit_object_is_marked_only_where_a_collision_ended_the_run() -> None:
     assert all(t == pytest.approx(end) for t, _ in marks)
 
 
+def test_trail_of_a_long_run_comes_in_few_pieces_and_is_whole_at_the_end() -> None:
+    run = episodes()[LEFT]
+    rows = np.repeat(np.arange(len(run.paths)), 8)
+    columns = {name: getattr(run, name)[rows] for name in ("observations", "qpos", "paths")}
+    many = replace(run, actions=run.actions[rows[1:] - 1], **columns)
+    recording = make_replay(TASK_OBJECT, many, run)
+    pieces = [
+        (m["name"], m["props"]["points"])
+        for _, m in messages(recording, "LineSegmentsMessage")
+        if m["name"].startswith("/A/trail/")
+    ]
+    shown = {
+        m["name"]
+        for _, m in messages(recording, "SetSceneNodeVisibilityMessage")
+        if m["visible"] and m["name"].startswith("/A/trail/")
+    }
+    assert TRAIL_PIECES / 2 < len(pieces) <= TRAIL_PIECES
+    assert shown == {name for name, _ in pieces}
+
+
 def test_episode_of_another_robot_is_refused_by_name() -> None:
     run = episodes()[LEFT]
     foreign = replace(run, qpos=np.zeros((len(run.qpos), 9), np.float32))
@@ -134,7 +200,7 @@ def test_smooth_keeps_the_frames_and_goes_the_short_way_between_them() -> None:
     positions = np.array([[[0.0, 0.0, 0.0]], [[1.0, 2.0, 4.0]]])
     # The same rotation twice, once with the opposite sign: half way it must not be zero.
     wxyz = np.array([[[1.0, 0.0, 0.0, 0.0]], [[-1.0, 0.0, 0.0, 0.0]]])
-    made = smooth(Poses(positions, wxyz), SUBFRAMES)
+    made = smooth(Poses(positions, wxyz), 2)
     np.testing.assert_array_equal(
         made.positions[:, 0], [[0.0, 0.0, 0.0], [0.5, 1.0, 2.0], [1.0, 2.0, 4.0]]
     )
@@ -142,7 +208,7 @@ def test_smooth_keeps_the_frames_and_goes_the_short_way_between_them() -> None:
 
 
 def test_smooth_of_a_single_frame_is_that_frame() -> None:
-    made = smooth(Poses(np.ones((1, 1, 3)), np.array([[[1.0, 0.0, 0.0, 0.0]]])), SUBFRAMES)
+    made = smooth(Poses(np.ones((1, 1, 3)), np.array([[[1.0, 0.0, 0.0, 0.0]]])), 2)
     assert len(made) == 1
     np.testing.assert_array_equal(made.positions[0, 0], [1.0, 1.0, 1.0])
 
