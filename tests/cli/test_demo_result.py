@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
+from rodif_core.spec import TaskName
+from rodif_core.tasks import get_task
 from worker.cli.loop import DemoConfig, DemoResult
 from worker.cli.main import main
 
@@ -78,3 +80,9 @@ def test_sizes_out_of_range_are_named(capsys: pytest.CaptureFixture[str]):
         DemoConfig(evaluation_episodes=0)
     assert main(["demo", "--headless", "--labels", "0"]) == 1
     assert "labels is 0, but must be at least 1" in capsys.readouterr().err
+
+
+def test_usual_sizes_grow_with_the_groups_and_measure_long_tasks_on_fewer_rollouts() -> None:
+    assert DemoConfig.for_task(get_task(TaskName.AVOID)) == DemoConfig()
+    stacking = DemoConfig.for_task(get_task(TaskName.STACKING_STATE))
+    assert (stacking.pairs, stacking.evaluation_episodes) == (420, 200)

@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -76,7 +77,6 @@ def sign_in_as_admin(system: System, password: str) -> str:
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
-    sizes = DemoConfig()
     parser = subparsers.add_parser("demo", help="the whole loop on a task, then the site")
     parser.add_argument(
         "task", nargs="?", choices=list(TaskName), default=TaskName.AVOID, help="default: avoid"
@@ -92,38 +92,30 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--port", type=int, help="port; 0 picks a free one (default: 8000)")
     for name, told in (
         ("episodes", "rollouts to collect"),
-        ("pairs", "pairs to choose among them"),
+        ("pairs", "pairs to choose among them; more for tasks of many groups"),
         ("labels", "preferences to give; pairs that look alike are answered 'equal' besides"),
         ("annotators", "simulated annotators"),
-        ("evaluation-episodes", "rollouts of each evaluation"),
+        ("evaluation-episodes", "rollouts of each evaluation; fewer for long tasks"),
         ("comparison-updates", "full-batch updates of literal RoDiF and DP-DPO"),
         ("seed", "of the rollouts and the flips"),
     ):
-        default = getattr(sizes, name.replace("-", "_"))
-        parser.add_argument(
-            f"--{name}", type=int, default=default, help=f"{told} (default %(default)s)"
-        )
+        usual = getattr(DemoConfig, name.replace("-", "_"))
+        parser.add_argument(f"--{name}", type=int, help=f"{told} (avoid: {usual})")
     parser.add_argument(
         "--flip-rate",
         type=float,
-        default=sizes.flip_rate,
-        help="share of the preferences that are flipped (default %(default)s)",
+        help=f"share of the preferences that are flipped (default {DemoConfig.flip_rate})",
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Start, play, print; then wait for Ctrl-C, or with --headless judge the result."""
-    config = DemoConfig(
-        episodes=args.episodes,
-        pairs=args.pairs,
-        labels=args.labels,
-        annotators=args.annotators,
-        flip_rate=args.flip_rate,
-        evaluation_episodes=args.evaluation_episodes,
-        comparison_updates=args.comparison_updates,
-        seed=args.seed,
-    )
+    from rodif_core.tasks import get_task
+
     task = TaskName(args.task)
+    given = {one.name: getattr(args, one.name) for one in fields(DemoConfig)}
+    wishes = {name: value for name, value in given.items() if value is not None}
+    config = replace(DemoConfig.for_task(get_task(task)), **wishes)
     shipped_checkpoint(task)  # says what to do when there is none, before anything starts
     settings = _settings(args)
 

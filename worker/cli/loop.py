@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import ValueOutOfRangeError
@@ -19,6 +19,7 @@ from server.states import PublishRule
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from rodif_core.tasks.base import Task
     from worker.cli.client import Client
     from worker.cli.simulate import SimulationReport
 
@@ -33,9 +34,15 @@ PATIENCE_SECONDS = 4 * 3600.0
 Say = Callable[[str], None]
 
 
+# A pair tells something when one of two rollouts is in the wanted group. With more groups, fewer of
+# the pairs across groups are: as many for each group as Avoid needs for its two and one to spare.
+PAIRS_PER_GROUP = 60
+LONG_TASK = 200  # control steps; policies for tasks with more are measured on fewer rollouts
+
+
 @dataclass(frozen=True)
 class DemoConfig:
-    """Sizes of the demo; the defaults take some minutes on 2 cores."""
+    """Sizes of the demo; the defaults are Avoid's and take some minutes on 2 cores."""
 
     episodes: int = 120
     pairs: int = 180
@@ -54,6 +61,13 @@ class DemoConfig:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
         if not 0 <= self.flip_rate < 0.5:
             raise ValueOutOfRangeError("flip_rate", self.flip_rate, "in [0, 0.5)")
+
+    @classmethod
+    def for_task(cls, task: Task) -> DemoConfig:
+        """Usual sizes for a task: more pairs where there are many groups, fewer rollouts to measure
+        where they take long."""
+        usual = cls(pairs=PAIRS_PER_GROUP * (len(task.groups) + 1))
+        return replace(usual, evaluation_episodes=200) if task.max_steps > LONG_TASK else usual
 
 
 @dataclass
