@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +23,8 @@ from torch.nn import functional as F
 
 from rodif_core.errors import LearningError, ValueOutOfRangeError
 from rodif_core.policies.normaliser import Normaliser
-from rodif_core.policies.policy import PolicyConfig
 from rodif_core.policies.resnet import ImageConfig, ImageEncoder
-from rodif_core.sight import Sight, draw
+from rodif_core.sight import draw
 from rodif_core.tasks.base import Task
 from rodif_core.tasks.camera import Camera
 from rodif_core.training_state import (
@@ -173,17 +172,3 @@ def _report(
         raise LearningError(f"the encoder's loss became {loss} at update {update}")
     held_out = float(model.error(*unseen.pick(torch.arange(len(unseen.felt)), device)))
     return {"update": float(update), "loss": loss, "held_out": held_out}
-
-
-def encode(
-    task: Task,
-    shape: PolicyConfig,
-    encoder: ImageEncoder | None,
-    demonstrations: Sequence[Trajectory],
-) -> list[Trajectory]:
-    """The demonstrations with the rows (N + 1, O) that a policy reads as their observations."""
-    with Sight(task, shape, encoder) as sight:
-        return [
-            replace(one, observations=sight.rows(one.observations, one.qpos))
-            for one in demonstrations
-        ]

@@ -20,7 +20,8 @@ from torch.nn import functional as F
 
 from rodif_core.diffusion.chain import add_noise
 from rodif_core.drift import fit_support, visited_states
-from rodif_core.encoder_training import encode, train_encoder
+from rodif_core.encoded_rows import encode
+from rodif_core.encoder_training import train_encoder
 from rodif_core.errors import LearningError
 from rodif_core.policies.checkpoint import Checkpoint, SupportSet
 from rodif_core.policies.normaliser import Normaliser
@@ -79,6 +80,7 @@ def pretrain(
     *,
     start: Checkpoint | None = None,
     workspace: Path | None = None,
+    kept_rows: Path | None = None,
     device: str = "cpu",
     precision: Precision | None = None,
     progress: Progress | None = None,
@@ -87,6 +89,7 @@ def pretrain(
 
     start      go on from this policy, with its size and normaliser, for `config.round_updates`,
                instead of from fresh weights for `config.updates`
+    kept_rows  folder for encoded pictures, which trainings with the same encoder may share
     precision  of the forward passes; by default mixed on a GPU
 
     The result holds the averaged weights, the normaliser and the support set. Raises
@@ -98,7 +101,7 @@ def pretrain(
     basis = {"device": device, "precision": precision.value, "start": start and start.digest}
     if workspace is not None:
         shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
-        claim_workspace(workspace, basis | shown | asdict(config))
+        claim_workspace(workspace, basis | shown | _deciding(config))
     task = get_task(task_name)
     known, held_out = _split(demonstrations, config)
     encoder, encoder_curve = start.policy.encoder if start else None, None
@@ -109,7 +112,7 @@ def pretrain(
             progress=progress,
         )  # fmt: skip
     shape = config.policy_config(task) if start is None else start.policy.config
-    seen, unseen = (encode(task, shape, encoder, part) for part in (known, held_out))
+    seen, unseen = (encode(task, shape, encoder, part, kept_rows) for part in (known, held_out))
     policy = _fresh(shape, seen, encoder, config) if start is None else start.policy.copy()
     average, curve = _train(
         policy,
@@ -122,15 +125,9 @@ def pretrain(
         progress,
     )
     policy = replace(policy, denoiser=average)
-    card = {
-        "kind": "pretrained",
-        "architecture": shape.architecture.value,
-        "preset": asdict(config),
-        **basis,
-        "demonstrations": len(demonstrations),
-        "held_out_curve": curve,
-        "encoder_curve": encoder_curve,
-    }
+    curves = {"held_out_curve": curve, "encoder_curve": encoder_curve}
+    facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
+    card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
     return Checkpoint(task_name, policy, _support(known, held_out, policy), card)
 
 
@@ -142,6 +139,12 @@ def _split(
     order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
     shuffled = [demonstrations[i] for i in order]
     return shuffled[count:], shuffled[:count]
+
+
+def _deciding(config: PretrainConfig) -> dict[str, Any]:
+    """What decides the result of one training; how many follow it does not, so that a finished
+    series can have another round."""
+    return {k: v for k, v in asdict(config).items() if k not in ("rounds", "recoveries")}
 
 
 def _fingerprint(demonstrations: Sequence[Trajectory]) -> str:

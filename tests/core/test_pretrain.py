@@ -187,4 +187,7 @@ def test_a_workspace_of_another_training_is_refused_and_kept(
         pretrain(TaskName.AVOID, demonstrations, longer, workspace=tmp_path)
     with pytest.raises(LearningError, match="demonstrations is"):
         pretrain(TaskName.AVOID, demonstrations[:-1], CONFIG, workspace=tmp_path)
+    # How many rounds follow does not decide this one.
+    again = pretrain(TaskName.AVOID, demonstrations, replace(CONFIG, rounds=2), workspace=tmp_path)
+    assert again.card["preset"]["rounds"] == 2
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

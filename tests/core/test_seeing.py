@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import torch
 
 from rodif_core import encoder_training
 from rodif_core.demonstrations import make_demonstrations
+from rodif_core.encoded_rows import encode
 from rodif_core.encoder_training import EncoderConfig, train_encoder
 from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.evaluate import summarise
@@ -122,6 +125,38 @@ def test_experts_take_over_from_a_policy_that_sees(checkpoint: Checkpoint) -> No
     further = pretrain(TASK.name, [*made, *make_demonstrations(TASK, episodes=4, seed=1)], config,
                        start=checkpoint)  # fmt: skip
     assert further.policy.encoder is checkpoint.policy.encoder
+
+
+def test_pictures_are_encoded_once_for_all_trainings_with_one_encoder(
+    checkpoint: Checkpoint, demonstrations: list[Trajectory], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    policy, two = checkpoint.policy, demonstrations[:2]
+    plain = encode(TASK, policy.config, policy.encoder, two)
+    first = encode(TASK, policy.config, policy.encoder, two, tmp_path / "rows")
+    files = sorted((tmp_path / "rows").iterdir())
+    assert len(files) == 2
+
+    drawn: list[int] = []
+    rows = Sight.rows
+
+    def count(self: Sight, observations: Any, qpos: Any) -> Any:
+        drawn.append(len(qpos))
+        return rows(self, observations, qpos)
+
+    monkeypatch.setattr(Sight, "rows", count)
+    third = demonstrations[2]
+    again = encode(TASK, policy.config, policy.encoder, [*two, third], tmp_path / "rows")
+    assert drawn == [len(third.qpos)]
+    for one, other, same in zip(plain, first, again, strict=False):
+        assert one.observations == pytest.approx(other.observations, abs=1e-6)
+        assert np.array_equal(other.observations, same.observations)
+    blurred = copy.deepcopy(policy.encoder)
+    assert blurred is not None
+    with torch.no_grad():
+        next(blurred.parameters()).mul_(0.5)
+    encode(TASK, policy.config, blurred, two, tmp_path / "rows")
+    assert drawn[1:] == [len(one.qpos) for one in two]
 
 
 def test_killed_encoder_training_goes_on_to_the_same_weights(

@@ -140,6 +140,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             config,
             start=checkpoint,
             workspace=workspace,
+            kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
             precision=Precision(args.precision) if args.precision else None,
             progress=show,
