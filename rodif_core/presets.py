@@ -141,11 +141,8 @@ PRESETS = {
 # On two cores the transformer of the paper's preset sees too few rows to learn Stacking; single
 # actions train an order of magnitude faster (docs/tasks.md has the figures). Missed grasps are what
 # demonstrations do not show, so that takeovers count for more than more demonstrations.
-_CPU_STACKING = replace(_MLP, size=MlpSize(width=256, blocks=4), updates=16_000)
-_OWN_BASES = {
-    ("stacking", "cpu"): _CPU_STACKING,
-    ("stacking-state", "cpu"): replace(_CPU_STACKING, rounds=3),
-}
+_CPU_STACKING = replace(_MLP, size=MlpSize(width=256, blocks=4), updates=16_000, rounds=3)
+_OWN_BASES = {("stacking", "cpu"): _CPU_STACKING, ("stacking-state", "cpu"): _CPU_STACKING}
 
 # Pushing needs wider layers and more updates than Avoid, and both look again sooner: a cube that
 # turned away from the rod is lost within eight control steps.

@@ -14,10 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rodif_core.demonstrations import Recording, mode_shares
-from rodif_core.policies.checkpoint import Checkpoint
-from rodif_core.rollout import rollout
-from rodif_core.spec import RolloutConfig
-from rodif_core.tasks import get_task
 from rodif_core.tasks.base import Array, Task
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts import Expert, draw_expert
@@ -39,25 +35,21 @@ class _Takeover:
 
 
 def make_recoveries(
-    checkpoint: Checkpoint, *, episodes: int, seed: int, preferred_share: float | None = None
+    task: Task, driven: Sequence[Trajectory], preferred_share: float | None = None
 ) -> list[Trajectory]:
     """What experts did after they took over from the policy, where it led to success.
 
-    The policy drives `episodes` of them, from seed on; each is driven again up to a step drawn from
-    those that it lasted, and the expert goes on from there. Takeovers that it cannot save are left
-    out. A trajectory begins at the takeover; its context is that of the whole episode, and
+    Each of the rollouts `driven` is driven again up to a step drawn from those that the policy
+    lasted, and the expert goes on from there. Takeovers that it cannot save are left out. A
+    trajectory begins at the takeover; its context is that of the whole episode, and
     info["taken_over_at"] tells the step.
 
     preferred_share  share of the task's preferred group where the policy has not chosen yet, by
                      default the task's own
-
-    Raises ValueOutOfRangeError for values out of range.
     """
-    task = get_task(checkpoint.task)
     shares = mode_shares(task, task.preferred_share if preferred_share is None else preferred_share)
-    driven = rollout(checkpoint, RolloutConfig(episodes=episodes, seed=seed))
     made: list[Trajectory] = []
-    for first in range(0, episodes, PARALLEL):
+    for first in range(0, len(driven), PARALLEL):
         takeovers = [_draw(task, one, shares) for one in driven[first : first + PARALLEL]]
         made += _recover(task, takeovers)
     return made

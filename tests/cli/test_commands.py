@@ -131,6 +131,7 @@ def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path
     assert made.policy.config.executed_steps == 4
     assert made.card["start"] is not None
     assert made.card["demonstrations"] == 4 + made.card["recoveries"]
+    assert made.card["success_before_rounds"] == [0.0]
     assert made.card["held_out_curve"][-1]["update"] == 2  # the last of three
 
 

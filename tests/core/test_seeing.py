@@ -119,7 +119,7 @@ def test_file_keeps_the_scale_of_states(checkpoint: Checkpoint) -> None:
 
 
 def test_experts_take_over_from_a_policy_that_sees(checkpoint: Checkpoint) -> None:
-    made = make_recoveries(checkpoint, episodes=2, seed=11)
+    made = make_recoveries(TASK, rollout(checkpoint, RolloutConfig(episodes=2, seed=11)))
     assert all(one.observations.shape[1] == TASK.observation_dim for one in made)
     config = replace(CONFIG, updates=2)
     further = pretrain(TASK.name, [*made, *make_demonstrations(TASK, episodes=4, seed=1)], config,

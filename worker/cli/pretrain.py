@@ -99,28 +99,29 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     from rodif_core.demonstrations import make_demonstrations
     from rodif_core.pretrain import pretrain
     from rodif_core.recoveries import make_recoveries
+    from rodif_core.rollout import rollout
     from rodif_core.tasks import get_task
     from rodif_core.training_state import Precision, check_device
 
     check_device(args.device)
+    task = get_task(args.task)
     making = bar.add_task("demonstrations", total=args.demonstrations)
     shown = make_demonstrations(
-        get_task(args.task),
+        task,
         episodes=args.demonstrations,
         seed=args.seed,
         preferred_share=args.preferred_share,
         progress=lambda done, _: bar.update(making, completed=done),
     )
     checkpoint = None
+    on_the_way: list[float] = []  # success of the policies that experts took over from
     for number in range(config.rounds + 1):
         if checkpoint is not None:
             first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
-            shown += make_recoveries(
-                checkpoint,
-                episodes=config.recoveries,
-                seed=first_seed,
-                preferred_share=args.preferred_share,
-            )
+            driven = rollout(checkpoint, RolloutConfig(episodes=config.recoveries, seed=first_seed))
+            on_the_way.append(sum(one.success for one in driven) / len(driven))
+            bar.console.print(f"before round {number}: success {on_the_way[-1]:.1%}")
+            shown += make_recoveries(task, driven, args.preferred_share)
         updates = config.round_updates if number else config.updates
         training = bar.add_task(f"training {number}", total=updates)
 
@@ -147,7 +148,11 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         )
         bar.update(training, total=updates, completed=updates)  # also one that was done before
     assert checkpoint is not None
-    facts = {"rounds": config.rounds, "recoveries": len(shown) - args.demonstrations}
+    facts = {
+        "rounds": config.rounds,
+        "recoveries": len(shown) - args.demonstrations,
+        "success_before_rounds": on_the_way,
+    }
     return replace(checkpoint, card=checkpoint.card | facts)
 
 
