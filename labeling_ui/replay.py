@@ -65,6 +65,7 @@ class _Side:
     origin: tuple[float, float, float]  # of the robot's frame, m
     poses: Poses  # seen from each body's parent
     path: NDArray[np.float32]  # (N + 1, 3), m
+    kept: int | None  # control steps that its trail stays in view; None: for good
     hit: int | None  # geom that ended the episode
 
 
@@ -107,7 +108,9 @@ def _side(name: str, x: float, task: Task, trajectory: Trajectory) -> _Side:
     model = scene_model(task).model
     poses = relative(body_poses(model, trajectory.qpos), model.body_parentid)
     poses = smooth(poses, subframes(task))
-    return _Side(name, (x, 0.0, 0.0), poses, trajectory.paths, hit_geom(task, trajectory))
+    kept = None if task.trail_seconds is None else round(task.trail_seconds / task.control_dt)
+    hit = hit_geom(task, trajectory)
+    return _Side(name, (x, 0.0, 0.0), poses, trajectory.paths, kept, hit)
 
 
 def _record(server: viser.ViserServer, task: Task, sides: tuple[_Side, _Side]) -> bytes:
@@ -185,14 +188,17 @@ class _Track:
         )
 
     def _add_trail(self, scene: Any, root: str) -> list[Any]:
-        """A pale line over the whole path, and strong pieces that appear as the rod moves."""
+        """Strong pieces that appear as the end effector moves, and a pale line over the whole path
+        where they stay."""
         colour = SIDE_COLOURS[self._side.name]
         points = np.asarray(self._side.path, dtype=np.float32)
         pieces = np.stack([points[:-1], points[1:]], axis=1)
         below = pieces - np.array([0.0, 0.0, 0.004], dtype=np.float32)  # else the two lines mix
-        scene.add_line_segments(
-            f"{root}/path", below, _mix(colour, PALE), thickness=2.0, thickness_units="screen"
-        )
+        if self._side.kept is None:
+            scene.add_line_segments(
+                f"{root}/path", below, _mix(colour, PALE), thickness=2.0, thickness_units="screen"
+            )
+        self._hidden = 0  # pieces that were in view and are no longer
         self._stride = max(1, math.ceil(len(pieces) / TRAIL_PIECES))  # control steps a piece
         return [
             scene.add_line_segments(
@@ -232,9 +238,19 @@ class _Track:
         step, between = divmod(frame, self._subframes)
         if frame and not between and (step % self._stride == 0 or last):
             self._trail[(step - 1) // self._stride].visible = True
+            self._hide_trail(step, last)
         if last:
             for handle in self._hit:
                 handle.visible = True
+
+    def _hide_trail(self, step: int, last: bool) -> None:
+        """What is too old goes piece by piece; when all is over, the rest."""
+        if self._side.kept is None:
+            return
+        old = len(self._trail) if last else max(0, (step - self._side.kept) // self._stride)
+        for piece in self._trail[self._hidden : old]:
+            piece.visible = False
+        self._hidden = old
 
 
 def _body_names(root: str, parents: NDArray[np.int32]) -> list[str]:

@@ -82,6 +82,8 @@ class Task(ABC):
     preferred_group: ClassVar[str]
     preferred_share: ClassVar[float] = 0.2  # of the preferred group in scripted demonstrations
     criterion: ClassVar[str]  # what annotators are asked
+    # How much of the end effector's path replays keep in view; None: all, where modes are ways.
+    trail_seconds: ClassVar[float | None] = None
 
     @abstractmethod
     def build_model(self, mesh: Mesh = "col") -> mujoco.MjModel:

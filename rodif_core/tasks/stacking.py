@@ -103,6 +103,7 @@ class StackingStateTask(Task):
     groups: ClassVar[tuple[str, ...]] = modes
     preferred_group: ClassVar[str] = "red-blue-green"
     preferred_share: ClassVar[float] = 0.26
+    trail_seconds: ClassVar[float | None] = 1.0  # more of it hides the tower
     criterion: ClassVar[str] = (
         "The robot should build the tower from the red block at the bottom, the blue one on it and "
         "the green one on top."

@@ -121,3 +121,19 @@ def test_every_shape_of_a_scene_is_known_to_thumbnails_and_maps(name: TaskName) 
     assert {shape["type"] for shape in task.scene_shapes()} <= drawn
     run = make_demonstrations(task, episodes=1, seed=0)[0]
     assert make_thumbnail(task, run, run)
+
+
+def test_trail_of_a_tower_being_built_is_short_and_does_not_hide_it() -> None:
+    task = get_task(TaskName.STACKING_STATE)
+    recording = make_replay(task, *pair(TaskName.STACKING_STATE))
+    names = {m["name"] for _, m in messages(recording, "LineSegmentsMessage")}
+    assert names and all("/trail/" in name for name in names)
+    shown: dict[str, float] = {}
+    told = messages(recording, "SetSceneNodeVisibilityMessage")
+    for time, message in sorted(told, key=lambda one: one[0]):
+        if message["visible"] and "/trail/" in message["name"]:
+            shown[message["name"]] = time
+        elif message["name"] in shown:
+            seconds = time - shown.pop(message["name"])
+            assert seconds <= task.trail_seconds + 4 * task.control_dt
+    assert not shown
