@@ -95,8 +95,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ("pairs", "pairs to choose among them; more for tasks of many groups"),
         ("labels", "preferences to give; pairs that look alike are answered 'equal' besides"),
         ("annotators", "simulated annotators"),
-        ("evaluation-episodes", "rollouts of each evaluation; fewer for long tasks"),
-        ("comparison-updates", "full-batch updates of literal RoDiF and DP-DPO"),
+        ("evaluation-episodes", "rollouts of each evaluation; 200 on long tasks"),
+        ("comparison-updates", "full-batch updates of literal RoDiF and DP-DPO; 4 on long tasks"),
         ("seed", "of the rollouts and the flips"),
     ):
         usual = getattr(DemoConfig, name.replace("-", "_"))

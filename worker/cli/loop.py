@@ -37,7 +37,7 @@ Say = Callable[[str], None]
 # A pair tells something when one of two rollouts is in the wanted group. With more groups, fewer of
 # the pairs across groups are: as many for each group as Avoid needs for its two and one to spare.
 PAIRS_PER_GROUP = 60
-LONG_TASK = 200  # control steps; policies for tasks with more are measured on fewer rollouts
+LONG_TASK = 200  # control steps
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,12 @@ class DemoConfig:
 
     @classmethod
     def for_task(cls, task: Task) -> DemoConfig:
-        """Usual sizes for a task: more pairs where there are many groups, fewer rollouts to measure
-        where they take long."""
+        """Usual sizes for a task: more pairs where there are many groups; where rollouts take long,
+        fewer to measure and fewer updates of the literal methods."""
         usual = cls(pairs=PAIRS_PER_GROUP * (len(task.groups) + 1))
-        return replace(usual, evaluation_episodes=200) if task.max_steps > LONG_TASK else usual
+        if task.max_steps <= LONG_TASK:
+            return usual
+        return replace(usual, evaluation_episodes=200, comparison_updates=4)
 
 
 @dataclass
