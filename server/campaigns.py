@@ -18,7 +18,7 @@ from server.errors import ConflictError, NotFoundError
 from server.publications import record_start
 from server.rounds import EVALUATION_SEED
 from server.snapshots import new_labels_since_round
-from server.states import Choice, JobKind, JobState, PairState
+from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs
 from server.store.events import audit
 from server.store.labels import is_effective
@@ -257,7 +257,7 @@ def _annotator_counts(session: Session, campaign_id: int) -> list[dict[str, Any]
     for row in rows:
         if row.duration_ms is not None:
             durations[row.annotator_id].append(row.duration_ms)
-        if row.choice in (Choice.FIRST, Choice.SECOND):
+        if row.choice in DECISIVE:
             sides[row.annotator_id].append((row.choice == Choice.FIRST) == row.first_is_left)
     accounts = session.scalars(select(Annotator).where(Annotator.id.in_(labels)))
     return [

@@ -21,6 +21,10 @@ from server.store.pairs import (
 from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pair
 
 MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetching
+# Pairs of which labels so far say that people will prefer one side come first, because a click on
+# "equal" teaches nothing. Every so many of an annotator's pairs comes in turn all the same: what
+# the first labels took for alike is looked at again.
+IN_TURN = 5
 
 
 class NothingReason(StrEnum):
@@ -99,11 +103,14 @@ def _take_open_pair(
     nothing else is left.
     """
     wanted = int(campaign.settings["labels_per_pair"])
+    telling_first = _handed_out(session, annotator_id) % IN_TURN != 0
     refused: list[int] = []
     skip_locked = True
     while True:
         query = (
-            open_pairs(now, campaign.id, annotator_id, labels_per_pair=wanted)
+            open_pairs(
+                now, campaign.id, annotator_id, labels_per_pair=wanted, telling_first=telling_first
+            )
             .where(Pair.id.not_in(refused))
             .limit(1)
             .with_for_update(of=Pair, key_share=True, skip_locked=skip_locked)
@@ -117,6 +124,11 @@ def _take_open_pair(
             return pair
         else:
             refused.append(pair.id)
+
+
+def _handed_out(session: Session, annotator_id: int) -> int:
+    leases = select(func.count()).where(Lease.annotator_id == annotator_id)
+    return session.scalars(leases.select_from(Lease)).one()
 
 
 def issue_lease(

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from server.errors import ConflictError, NotAllowedError, NotFoundError
 from server.handout import Handout, handout, issue_lease
 from server.sign_in import Me
-from server.states import AnnotatorKind, Choice
+from server.states import DECISIVE, AnnotatorKind, Choice
 from server.store.events import add_event
 from server.store.labels import newest_label
 from server.store.session import LOCK
@@ -66,7 +66,7 @@ def choice_of(side: ScreenChoice, *, first_is_left: bool) -> Choice:
 
 def side_of(choice: Choice, *, first_is_left: bool) -> ScreenChoice:
     """From the episode to the side of the screen."""
-    if choice in (Choice.FIRST, Choice.SECOND):
+    if choice in DECISIVE:
         is_left = (choice is Choice.FIRST) == first_is_left
         return ScreenChoice.LEFT if is_left else ScreenChoice.RIGHT
     return ScreenChoice(choice.value)

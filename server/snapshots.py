@@ -11,7 +11,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from server.errors import ConflictError, NotFoundError
-from server.states import Choice, PublishRule
+from server.states import DECISIVE, PublishRule
 from server.store.labels import effective_label_ids, snapshot_labels
 from server.store.tables import LabelSnapshot, Round
 
@@ -57,8 +57,7 @@ def snapshot_to_learn_from(
         if found is None or found.campaign_id != campaign_id:
             raise NotFoundError(f"label snapshot of campaign {campaign_id}", digest)
         snapshot = found
-    usable = {Choice.FIRST, Choice.SECOND}
-    if not any(row.choice in usable for row in snapshot_labels(session, snapshot.digest)):
+    if not any(row.choice in DECISIVE for row in snapshot_labels(session, snapshot.digest)):
         raise ConflictError(
             f"campaign {campaign_id} has {snapshot.size} labels in force, but none says which"
             " episode is better; collect labels first"

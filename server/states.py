@@ -29,6 +29,9 @@ class Choice(StrEnum):
     CANNOT_TELL = "cannot_tell"
 
 
+DECISIVE = (Choice.FIRST, Choice.SECOND)  # choices that fine-tuning learns from
+
+
 class PairState(StrEnum):
     """Life of a pair."""
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
-from sqlalchemy import ColumnElement, Select, func, select, union_all
-from sqlalchemy.orm import Session
+from sqlalchemy import ColumnElement, Select, Subquery, case, func, select, union_all
+from sqlalchemy.orm import Session, aliased
 
-from server.states import PairState
+from server.states import DECISIVE, PairState
 from server.store.labels import is_effective
-from server.store.tables import Label, Lease, Pair
+from server.store.tables import Episode, Label, Lease, Pair
 
 
 def live_leases(
@@ -30,12 +32,18 @@ def _is_live(now: datetime) -> ColumnElement[bool]:
 
 
 def open_pairs(
-    now: datetime, campaign_id: int, annotator_id: int, *, labels_per_pair: int
+    now: datetime,
+    campaign_id: int,
+    annotator_id: int,
+    *,
+    labels_per_pair: int,
+    telling_first: bool = False,
 ) -> Select[Pair]:
     """Ready pairs with room for one more label, which this annotator has neither done nor got.
 
-    Those with most room come first. Sets instead of a look-up per pair: with thousands of pairs
-    that is many times faster on both engines.
+    Those with most room come first, then the oldest, or with `telling_first` those of which the
+    labels so far say that people will prefer one side. Sets instead of a look-up per pair: with
+    thousands of pairs that is many times faster on both engines.
     """
     labels = select(Label.pair_id).where(Label.campaign_id == campaign_id, is_effective())
     leases = select(Lease.pair_id).where(_is_live(now))
@@ -47,7 +55,7 @@ def open_pairs(
         select(others.c.pair_id, func.count().label("count")).group_by(others.c.pair_id).subquery()
     )
     count = func.coalesce(taken.c["count"], 0)
-    return (
+    query = (
         select(Pair)
         .outerjoin(taken, taken.c.pair_id == Pair.id)
         .where(
@@ -57,7 +65,59 @@ def open_pairs(
             Pair.id.not_in(leases.where(Lease.annotator_id == annotator_id)),
             count < labels_per_pair,
         )
-        .order_by(count, Pair.id)
+        .order_by(count)
+    )
+    if telling_first:
+        kinds = _with_kinds(query)
+        told = _told_by_kinds(campaign_id)
+        known = (told.c.one == kinds.one) & (told.c.other == kinds.other)
+        # The mean of a rate after `total` labels, if nothing was known of it before: what nobody
+        # has seen yet stands in the middle, and so is tried before what tells nothing.
+        rate = func.coalesce((told.c.decided + 1.0) / (told.c.total + 2.0), 0.5)
+        query = kinds.query.outerjoin(told, known).order_by(rate.desc())
+    return query.order_by(Pair.id)
+
+
+@dataclass(frozen=True)
+class _Kinds:
+    """A query over pairs that knows the kinds of their two episodes, in alphabetical order."""
+
+    query: Select[Any]
+    one: ColumnElement[str]
+    other: ColumnElement[str]
+
+
+def _with_kinds(query: Select[Any]) -> _Kinds:
+    """An episode's kind is its behaviour group and whether it succeeded."""
+    first, second = aliased(Episode), aliased(Episode)
+    kinds = [
+        func.coalesce(episode.group, "") + case((episode.success, "+"), else_="-")
+        for episode in (first, second)
+    ]
+    ordered = kinds[0] <= kinds[1]
+    return _Kinds(
+        query.join(first, first.id == Pair.first_episode_id).join(
+            second, second.id == Pair.second_episode_id
+        ),
+        case((ordered, kinds[0]), else_=kinds[1]),
+        case((ordered, kinds[1]), else_=kinds[0]),
+    )
+
+
+def _told_by_kinds(campaign_id: int) -> Subquery:
+    """How many labels in force compared two kinds of episodes, and how many preferred a side."""
+    labels = select(Label).join(Pair, Pair.id == Label.pair_id)
+    kinds = _with_kinds(labels.where(Label.campaign_id == campaign_id, is_effective()))
+    decisive = case((Label.choice.in_(DECISIVE), 1), else_=0)
+    return (
+        kinds.query.with_only_columns(
+            kinds.one.label("one"),
+            kinds.other.label("other"),
+            func.count().label("total"),
+            func.sum(decisive).label("decided"),
+        )
+        .group_by(kinds.one, kinds.other)
+        .subquery()
     )
 
 

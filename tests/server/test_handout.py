@@ -13,7 +13,7 @@ from server.handout import Handout, NothingReason, next_pair
 from server.labeling import ScreenChoice, Submission, submit_label
 from server.states import PairState
 from server.store.session import Database
-from server.store.tables import Label, Lease, Pair
+from server.store.tables import Episode, Label, Lease, Pair
 from tests import factories
 from tests.factories import NOW
 from tests.server.threads import at_once
@@ -154,6 +154,60 @@ def test_pairs_with_fewer_labels_come_first(world: World) -> None:
     first = _next(world, "ann", campaign_id)
     assert first["pair"]["id"] == pair_ids[0]
     assert _next(world, "bob", campaign_id)["pair"]["id"] == pair_ids[1]
+
+
+def _set_kinds(world: World, pair_ids: list[int], *kinds: tuple[str | None, bool]) -> None:
+    """Behaviour group and success of the first and the second episode of those pairs."""
+    with world.database.write() as session:
+        for pair_id in pair_ids:
+            pair = session.get_one(Pair, pair_id)
+            episodes = (pair.first_episode_id, pair.second_episode_id)
+            for episode_id, (group, success) in zip(episodes, kinds, strict=True):
+                episode = session.get_one(Episode, episode_id)
+                episode.group, episode.success = group, success
+
+
+def test_pairs_of_kinds_that_people_can_judge_come_first(world: World) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=14)
+    alike, telling = pair_ids[:7], pair_ids[7:]
+    _set_kinds(world, alike, ("blue", True), ("green", True))
+    # The same two groups in either order, and a failure that settled none: kinds of their own.
+    _set_kinds(world, telling[::2], ("red", True), ("green", True))
+    _set_kinds(world, telling[1::2], ("green", True), ("red", True))
+    _set_kinds(world, telling[-1:], (None, False), ("red", True))
+    got = []
+    for _ in range(8):
+        handed = _next(world, "ann", campaign_id)
+        got.append(handed["pair"]["id"])
+        _label(world, "ann", handed, "equal" if got[-1] in alike else "left")
+    # The first and the sixth come in turn; what was judged most often comes before what nobody has
+    # seen yet, and that before what was found alike.
+    assert got == [alike[0], *telling[:4], alike[1], *telling[4:6]]
+    got = [_next_labelled(world, campaign_id) for _ in range(6)]
+    assert got == [telling[6], alike[2], *alike[3:]]
+
+
+def _next_labelled(world: World, campaign_id: int) -> int:
+    handed = _next(world, "ann", campaign_id)
+    _label(world, "ann", handed, "cannot_tell")
+    found: int = handed["pair"]["id"]
+    return found
+
+
+def test_labels_of_another_campaign_and_those_taken_back_do_not_count(world: World) -> None:
+    other_id, (other,) = world.add_campaign(pairs=1)
+    campaign_id, pair_ids = world.add_campaign(pairs=3)
+    _set_kinds(world, [other, *pair_ids[:2]], ("blue", True), ("green", True))
+    _set_kinds(world, pair_ids[2:], ("red", True), ("green", True))
+    _label(world, "bob", _next(world, "bob", other_id), "equal")
+    handed = _next(world, "bob", campaign_id)
+    assert handed["pair"]["id"] == pair_ids[0]
+    stored = _label(world, "bob", handed, "equal")
+    undone = world.client("bob").post(
+        f"/labels/{stored['id']}/undo", headers={"Idempotency-Key": "undo"}
+    )
+    assert undone.is_success, undone.text
+    assert _next(world, "bob", campaign_id, hold=2)["pair"]["id"] == pair_ids[1]
 
 
 def test_an_archived_campaign_hands_out_nothing(world: World) -> None:
