@@ -20,7 +20,7 @@ from rodif_core.guided import finetune_guided
 from rodif_core.log_ratio import PairMatrix, Transitions, kl_per_trajectory
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
-from rodif_core.preferences.pairs import Preference
+from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.spec import FinetuneConfig, FinetuneMethod
 from rodif_core.trajectory import Trajectory
 
@@ -44,33 +44,35 @@ def finetune(
     preferences: Sequence[Preference],
     config: FinetuneConfig,
     *,
+    ties: Sequence[Tie] = (),
     workspace: Path | None = None,
     progress: Progress | None = None,
 ) -> FinetuneResult:
     """Steer the policy towards the preferred trajectories; the given checkpoint is the reference.
 
-    preferences index into trajectories. `workspace` keeps partial state, so that a second call
+    preferences and ties index into trajectories; only `rodif_guided` learns from ties, the
+    paper's methods know none. `workspace` keeps partial state, so that a second call
     with the same arguments goes on where the first was killed. Raises LearningError without
     usable labels or when conservativeness is not set (estimate it from the labels first).
     """
     if config.conservativeness is None and config.method is not FinetuneMethod.DP_DPO:
         raise LearningError("conservativeness is not set: estimate it from the labels first")
-    for preference in preferences:
-        if not all(0 <= i < len(trajectories) for i in (preference.winner, preference.loser)):
-            raise LearningError(
-                f"preference {preference} names a trajectory outside 0 … {len(trajectories) - 1}"
-            )
+    labels: list[Preference | Tie] = [*preferences, *ties]
+    for label in labels:
+        if not all(0 <= index < len(trajectories) for index in label.pair):
+            raise LearningError(f"{label} names a trajectory outside 0 … {len(trajectories) - 1}")
     transitions = Transitions.collect(checkpoint.policy, trajectories, config.chunk_rows)
     report: dict[str, Any] = {
         "method": config.method.value,
         "pairs": len(preferences),
+        "ties": len(ties),
         "trajectories": len(trajectories),
         "decisions": len(transitions.chains),
     }
     if config.method is FinetuneMethod.RODIF_GUIDED:
         policy, details = finetune_guided(
             checkpoint, trajectories, preferences, transitions, config,
-            workspace=workspace, progress=progress,
+            ties=ties, workspace=workspace, progress=progress,
         )  # fmt: skip
         report |= details
     else:

@@ -29,7 +29,7 @@ from rodif_core.log_ratio import (
 )
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
-from rodif_core.preferences.pairs import Preference
+from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.rollout import rollout
 from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Scorer
@@ -77,14 +77,16 @@ def finetune_guided(
     transitions: Transitions,
     config: FinetuneConfig,
     *,
+    ties: Sequence[Tie] = (),
     workspace: Path | None,
     progress: Progress | None,
 ) -> tuple[DiffusionPolicy, dict[str, Any]]:
     """Score, guide at every scale, choose; optional self-training. Returns policy and report."""
     matrix = PairMatrix.build(transitions, preferences, config)
     scores = score(
-        checkpoint, trajectories, preferences, transitions, matrix, config, workspace, progress
-    )
+        checkpoint, trajectories, preferences, transitions, matrix, config,
+        ties=ties, workspace=workspace, progress=progress,
+    )  # fmt: skip
     histories, chunks = _kept_decisions(transitions, scores.kept)
     base = _try(checkpoint, checkpoint.policy, 0.0, scores, config)
     trials: list[Trial] = []
@@ -121,6 +123,8 @@ def score(
     transitions: Transitions,
     matrix: PairMatrix,
     config: FinetuneConfig,
+    *,
+    ties: Sequence[Tie] = (),
     workspace: Path | None = None,
     progress: Progress | None = None,
 ) -> Scores:
@@ -133,7 +137,7 @@ def score(
     ratios = compute_ratios(moved.policy, transitions, config)
     network = np.asarray(mean_ratio_per_trajectory(ratios, transitions))
     path_utility = PathUtility.fit(
-        PathFeatures.of(trajectories, get_task(checkpoint.task)), preferences
+        PathFeatures.of(trajectories, get_task(checkpoint.task)), preferences, ties
     )
     opinions = {
         Scorer.NETWORK: standardise(network),

@@ -6,8 +6,8 @@ hardly better than a coin. Two models share strength between trajectories:
 * the network: a few full-batch RoDiF updates on a throw-away copy of the policy; a trajectory's
   utility is its mean log-ratio. Needs no features.
 * the Gaussian process: Bradley-Terry utilities with a Gaussian-process prior over the paths of
-  the end effector and the objects, and the outcome. Also predicts the utility of trajectories
-  that nobody has seen.
+  the end effector and the objects, and the outcome. Learns from answers "equal" too, and predicts
+  the utility of trajectories that nobody has seen.
 
 Legend: R trajectories, M preferences, B movable objects, P points of a trajectory: of the end
 effector's path and of every object's.
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import LearningError
-from rodif_core.preferences.pairs import Preference
+from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.tasks.base import Task
 from rodif_core.trajectory import Trajectory
 
@@ -32,6 +32,7 @@ PATH_POINTS = 16  # of one path, evenly spaced along the end effector's; P = 16 
 PRIOR_SD = 0.5  # of the utilities within one outcome, in Bradley-Terry log-odds
 OUTCOME_VARIANCE = 0.5  # of the common utility of successes (or failures), in units of PRIOR_SD²
 SCALE_FACTOR = 2.0  # length scale of each point's kernel, in median distances of that point
+TIE_SD = 0.4  # of the difference of two utilities that people call equal, in log-odds
 JITTER = 1e-6  # on the kernel's diagonal, for its inverse
 NEWTON_STEPS = 50
 TOLERANCE = 1e-9  # largest change of a utility that still counts as movement
@@ -76,8 +77,17 @@ class PathUtility:
     weights: Array
 
     @classmethod
-    def fit(cls, features: PathFeatures, preferences: Sequence[Preference]) -> PathUtility:
+    def fit(
+        cls,
+        features: PathFeatures,
+        preferences: Sequence[Preference],
+        ties: Sequence[Tie] = (),
+    ) -> PathUtility:
         """Newton's method on the concave log-posterior; deterministic.
+
+        A tie says that two utilities differ by no more than about TIE_SD. With several modes most
+        answers can be ties, and they alone tell that a mode nobody has compared with the preferred
+        one is as far from it as those that were.
 
         Raises LearningError without preferences.
         """
@@ -87,15 +97,15 @@ class PathUtility:
         count = len(features.points)
         kernel = _kernel(features, features, scales) + JITTER * np.eye(count)
         precision = np.linalg.inv(kernel)
-        design = np.zeros((len(preferences), count))
-        rows = np.arange(len(preferences))
-        design[rows, [p.winner for p in preferences]] = 1.0
-        design[rows, [p.loser for p in preferences]] = -1.0
+        design = _differences(preferences, count)
+        tied = _differences(ties, count)
+        # Both are quadratic in the utilities, and act on them as one prior.
+        confidence = precision + tied.T @ tied / TIE_SD**2
         utilities = np.zeros(count)
         for _ in range(NEWTON_STEPS):
             chance = 1 / (1 + np.exp(-(design @ utilities)))
-            gradient = design.T @ (1 - chance) - precision @ utilities
-            hessian = design.T @ (design * (chance * (1 - chance))[:, None]) + precision
+            gradient = design.T @ (1 - chance) - confidence @ utilities
+            hessian = design.T @ (design * (chance * (1 - chance))[:, None]) + confidence
             step = np.linalg.solve(hessian, gradient)
             utilities = utilities + step
             if np.abs(step).max() < TOLERANCE:
@@ -106,6 +116,15 @@ class PathUtility:
         """Posterior-mode utility of other paths → (R',)."""
         predicted: Array = _kernel(features, self.features, self.scales) @ self.weights
         return predicted
+
+
+def _differences(labels: Sequence[Preference | Tie], count: int) -> Array:
+    """(M, count); times utilities, each row is the first trajectory's less the second's."""
+    rows = np.zeros((len(labels), count))
+    for row, label in zip(rows, labels, strict=True):
+        first, second = label.pair
+        row[first], row[second] = 1.0, -1.0
+    return rows
 
 
 def standardise(scores: Array) -> Array:

@@ -26,6 +26,24 @@ class Preference:
     loser: int
     annotator: int = 0
 
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Winner and loser."""
+        return self.winner, self.loser
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Two trajectories that an annotator called equally good."""
+
+    first: int
+    second: int
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Both, in the order in which they were named."""
+        return self.first, self.second
+
 
 @dataclass(frozen=True)
 class ChosenPair:

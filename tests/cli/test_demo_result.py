@@ -85,4 +85,4 @@ def test_sizes_out_of_range_are_named(capsys: pytest.CaptureFixture[str]):
 def test_usual_sizes_grow_with_the_groups_and_measure_long_tasks_on_fewer_rollouts() -> None:
     assert DemoConfig.for_task(get_task(TaskName.AVOID)) == DemoConfig()
     stacking = DemoConfig.for_task(get_task(TaskName.STACKING_STATE))
-    assert (stacking.pairs, stacking.evaluation_episodes) == (420, 200)
+    assert (stacking.pairs, stacking.evaluation_episodes) == (300, 200)

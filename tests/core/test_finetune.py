@@ -18,8 +18,8 @@ from rodif_core.finetune import finetune
 from rodif_core.guidance import guidance_target, guide
 from rodif_core.guided import near_data
 from rodif_core.log_ratio import PairMatrix, Transitions
-from rodif_core.preferences.pairs import Preference
-from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
+from rodif_core.preferences.pairs import Preference, Tie
+from rodif_core.scoring import TIE_SD, PathFeatures, PathUtility, split_threshold, standardise
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, GuideConfig
 from rodif_core.tasks import get_task
 from tests.core.learning import chain_trajectory, tiny_checkpoint, tiny_policy
@@ -109,6 +109,8 @@ def test_missing_conservativeness_is_refused() -> None:
 def test_preference_outside_the_trajectories_is_named() -> None:
     with pytest.raises(LearningError, match=r"winner=7.*0 … 5"):
         finetune(tiny_checkpoint(), labelled_trajectories(), [Preference(7, 0)], RODIF)
+    with pytest.raises(LearningError, match=r"second=9.*0 … 5"):
+        finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF, ties=[Tie(0, 9)])
 
 
 @pytest.mark.parametrize(("scale", "expected"), [(0.0, 0.2), (1.0, 1.0), (2.0, 1.8), (3.0, 2.6)])
@@ -152,6 +154,35 @@ def test_path_utility_of_two_paths_matches_hand_worked_number() -> None:
     assert fit.utilities[1] == pytest.approx(-u)
     assert u / variance == pytest.approx(4 * (1 - 1 / (1 + np.exp(-2 * u))), rel=1e-4)
     assert fit.predict(features) == pytest.approx(fit.utilities, abs=1e-4)
+
+
+def test_path_utility_of_a_tied_pair_matches_hand_worked_number() -> None:
+    # As above; a tie pulls with the slope of (2u)² / (2 TIE_SD²), which is 2u / TIE_SD² for each.
+    points = np.array([[[0.0, 0.0, 0.0]], [[3.0, 4.0, 0.0]]])
+    features = PathFeatures(points, np.array([True, True]))
+    u = PathUtility.fit(features, [Preference(0, 1)] * 4, [Tie(1, 0)]).utilities[0]
+    variance = 0.25 * (1 - np.exp(-1 / 8))
+    pulled = u / variance + 2 * u / TIE_SD**2
+    assert pulled == pytest.approx(4 * (1 - 1 / (1 + np.exp(-2 * u))), rel=1e-4)
+    assert 0 < u < PathUtility.fit(features, [Preference(0, 1)] * 4).utilities[0]
+
+
+def test_ties_tell_a_mode_apart_that_was_hardly_compared_with_the_preferred_one() -> None:
+    rng = np.random.default_rng(0)
+    # The preferred way, one beside it, and one far away; eight trajectories each.
+    places = np.repeat([0.40, 0.45, 0.60], 8) + rng.normal(0, 0.005, 24)
+    policy = tiny_policy()
+    runs = [chain_trajectory(policy, 1, seed=i, x=float(x)) for i, x in enumerate(places)]
+    features = PathFeatures.of(runs, AVOID)
+    preferences = [Preference(i % 8, 16 + j) for i, j in enumerate(rng.integers(0, 8, 40))]
+    ties = [Tie(8 + i % 8, 16 + j) for i, j in enumerate(rng.integers(0, 8, 40))]
+
+    def liked(ties: list[Tie]) -> np.ndarray:
+        utilities = PathUtility.fit(features, preferences, ties).utilities
+        return np.asarray(utilities > split_threshold(utilities))
+
+    assert liked([])[:16].all()  # what lies beside the preferred way passes for it
+    assert liked(ties).tolist() == [True] * 8 + [False] * 16
 
 
 def test_path_utility_recovers_the_side_from_sparse_noisy_labels() -> None:

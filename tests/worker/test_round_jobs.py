@@ -133,6 +133,8 @@ def test_lesson_turns_labels_into_winners_whatever_the_side(world: World) -> Non
             winner,
             {item.first, item.second},
         )
+    (tied,) = (item for item in lesson.comparisons if item.choice == "equal")
+    assert [tie.pair for tie in lesson.ties] == [(tied.first, tied.second)]
 
 
 def test_parent_is_rolled_out_once_for_many_rounds(

@@ -34,9 +34,9 @@ PATIENCE_SECONDS = 4 * 3600.0
 Say = Callable[[str], None]
 
 
-# A pair tells something when one of two rollouts is in the wanted group. With more groups, fewer of
-# the pairs across groups are: as many for each group as Avoid needs for its two and one to spare.
-PAIRS_PER_GROUP = 60
+# With more groups, fewer of the pairs have a rollout of the wanted one: so many more for each group
+# beyond Avoid's two let about as many pairs be judged.
+PAIRS_PER_GROUP = 30
 LONG_TASK = 200  # control steps
 
 
@@ -66,7 +66,7 @@ class DemoConfig:
     def for_task(cls, task: Task) -> DemoConfig:
         """Usual sizes for a task: more pairs where there are many groups; where rollouts take long,
         fewer to measure and fewer updates of the literal methods."""
-        usual = cls(pairs=PAIRS_PER_GROUP * (len(task.groups) + 1))
+        usual = cls(pairs=cls.pairs + PAIRS_PER_GROUP * (len(task.groups) - 2))
         if task.max_steps <= LONG_TASK:
             return usual
         return replace(usual, evaluation_episodes=200, comparison_updates=4)

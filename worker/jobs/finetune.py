@@ -20,7 +20,7 @@ from rodif_core.errors import LearningError
 from rodif_core.finetune import FinetuneResult, finetune
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
 from rodif_core.preferences.noise import CHOICES, Comparison, estimate_noise
-from rodif_core.preferences.pairs import Preference
+from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.spec import FinetuneConfig
 from rodif_core.trajectory import Trajectory
 from server import rounds
@@ -53,6 +53,13 @@ class Lesson:
             if item.choice != Choice.EQUAL
         ]
 
+    @property
+    def ties(self) -> list[Tie]:
+        """The comparisons that call both equally good."""
+        return [
+            Tie(item.first, item.second) for item in self.comparisons if item.choice == Choice.EQUAL
+        ]
+
 
 def run(attempt: Attempt) -> None:
     """Do the job, or what is left of it."""
@@ -74,6 +81,7 @@ def run(attempt: Attempt) -> None:
         [Trajectory.from_bytes(artifacts.get(file)) for file in lesson.episode_files],
         lesson.preferences,
         config,
+        ties=lesson.ties,
         workspace=workspace,
         progress=attempt.progress,
     )
