@@ -22,7 +22,7 @@ from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pai
 
 MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetching
 # Pairs of which labels so far say that people will prefer one side come first, because a click on
-# "equal" teaches nothing. Every so many of an annotator's pairs comes in turn all the same: what
+# "equal" teaches less. Every so many of an annotator's pairs comes in turn all the same: what
 # the first labels took for alike is looked at again.
 IN_TURN = 5
 
