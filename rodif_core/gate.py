@@ -10,6 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from rodif_core.intervals import surely_below
+
+MOST_LOST = 0.05  # success that a candidate may lose, even where chance could explain more …
+ROUNDING = 1e-9  # … and what a difference of two rates is off by in binary
 OFF_SUPPORT_RATIO = 1.5  # candidate may leave the data at most this much more than its parent …
 OFF_SUPPORT_SLACK = 0.02  # … plus this share, so that a parent at 0 does not forbid everything
 
@@ -29,13 +33,17 @@ class GateVerdict:
 def judge(before: Mapping[str, Any], after: Mapping[str, Any]) -> GateVerdict:
     """Compare two `Evaluation.to_json()`: success must not fall, drift must stay small.
 
-    Success counts as fallen when even the candidate's upper 95 % bound lies below the parent's
-    rate, or the rate fell by more than 5 points.
+    Success counts as fallen when the rate fell by more than MOST_LOST, or by more than chance
+    explains: the 95 % interval of the difference lies below 0.
     """
     reasons = []
-    floor = max(before["success"] - 0.05, 0.0)
-    upper = after["intervals"]["success"][1]
-    success_ok = after["success"] >= floor and upper >= before["success"]
+    lost = before["success"] - after["success"]
+    success_ok = lost <= MOST_LOST + ROUNDING and not surely_below(
+        before["success"],
+        before["intervals"]["success"],
+        after["success"],
+        after["intervals"]["success"],
+    )
     reasons.append(
         f"success {before['success']:.1%} → {after['success']:.1%} (n = {after['n']}): "
         + ("kept" if success_ok else "fell too far")

@@ -45,9 +45,14 @@ class Transitions:
     def collect(
         cls, reference: DiffusionPolicy, trajectories: Sequence[Trajectory], chunk_rows: int
     ) -> Transitions:
-        """Stack the trajectories and cache the reference means."""
+        """Stack the trajectories and cache the reference means.
+
+        Raises LearningError for trajectories without decisions, or with decisions of another
+        shape than the reference's.
+        """
         if not trajectories or any(len(t.decision_steps) == 0 for t in trajectories):
             raise LearningError("fine-tuning needs trajectories with denoising chains, got none")
+        _check_shapes(reference, trajectories)
         histories = np.concatenate([trajectory.histories for trajectory in trajectories])
         chains = torch.from_numpy(np.concatenate([t.chains for t in trajectories]))
         normalised = reference.normaliser.observation(torch.from_numpy(histories))
@@ -63,6 +68,22 @@ class Transitions:
     def steps_of(self, trajectory: int) -> range:
         """Rows of one trajectory."""
         return range(self.starts[trajectory], self.starts[trajectory + 1])
+
+
+def _check_shapes(reference: DiffusionPolicy, trajectories: Sequence[Trajectory]) -> None:
+    size = reference.config
+    wanted = {
+        "chains": (size.denoising_steps + 1, size.predicted_steps, size.action_dim),
+        "histories": (size.observation_steps, size.observation_dim),
+    }
+    for index, trajectory in enumerate(trajectories):
+        for name, shape in wanted.items():
+            found = getattr(trajectory, name).shape[1:]
+            if found != shape:
+                raise LearningError(
+                    f"trajectory {index} has {name} of shape {found} a decision, the reference "
+                    f"policy's are {shape}: another policy made it"
+                )
 
 
 @dataclass(frozen=True, eq=False)

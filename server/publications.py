@@ -11,7 +11,7 @@ from server.errors import ConflictError, NotFoundError
 from server.states import PublishRule
 from server.store.events import add_event, audit
 from server.store.session import LOCK
-from server.store.tables import Campaign, Checkpoint, Publication, Round
+from server.store.tables import Campaign, Checkpoint, Episode, Publication, Round
 
 
 def publish(
@@ -25,8 +25,8 @@ def publish(
 ) -> Publication:
     """Move the alias to `checkpoint_id`; `by` None means that the gate of a round did it.
 
-    Raises NotFoundError, or ConflictError for a checkpoint of another task, of a comparison round,
-    or one that is published already.
+    Raises NotFoundError, or ConflictError for a checkpoint of another task, of another pretrained
+    policy than the campaign's runs, of a comparison round, or one that is published already.
     """
     campaign = _locked_campaign(session, campaign_id)
     checkpoint = session.get(Checkpoint, checkpoint_id)
@@ -39,6 +39,7 @@ def publish(
         )
     if checkpoint.id == campaign.published_checkpoint_id:
         raise ConflictError(f"checkpoint {checkpoint_id} is published already")
+    _refuse_another_family(session, campaign, checkpoint)
     if checkpoint.round_id is not None:
         parent_round = session.get_one(Round, checkpoint.round_id)
         if parent_round.publish_rule == PublishRule.NEVER:
@@ -83,6 +84,28 @@ def record_start(session: Session, now: datetime, campaign: Campaign, *, by: int
             at=now,
         )
     )
+
+
+def _refuse_another_family(session: Session, campaign: Campaign, checkpoint: Checkpoint) -> None:
+    """Rounds learn from all runs of a campaign, so all of its policies must have scaled what they
+    saw and did alike. They do when they descend from one pretrained policy."""
+    published = session.get_one(Checkpoint, campaign.published_checkpoint_id)
+    theirs, ours = _pretrained(session, checkpoint), _pretrained(session, published)
+    has_runs = session.scalars(
+        select(Episode.id).where(Episode.campaign_id == campaign.id).limit(1)
+    ).first()
+    if theirs.id != ours.id and has_runs is not None:
+        raise ConflictError(
+            f"checkpoint {checkpoint.id} descends from {theirs.name!r} (checkpoint {theirs.id}),"
+            f" the runs of campaign {campaign.id} from {ours.name!r} (checkpoint {ours.id}):"
+            " one round cannot learn from both; start a new campaign"
+        )
+
+
+def _pretrained(session: Session, checkpoint: Checkpoint) -> Checkpoint:
+    while checkpoint.parent_id is not None:
+        checkpoint = session.get_one(Checkpoint, checkpoint.parent_id)
+    return checkpoint
 
 
 def _locked_campaign(session: Session, campaign_id: int) -> Campaign:

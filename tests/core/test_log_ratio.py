@@ -118,3 +118,13 @@ def test_pair_matrix_without_preferences_says_what_to_do() -> None:
     _, _, transitions = batch()
     with pytest.raises(LearningError, match="label some pairs"):
         PairMatrix.build(transitions, [], CONFIG)
+
+
+def test_chains_of_another_policy_are_refused() -> None:
+    longer = tiny_policy(steps=7)
+    with pytest.raises(LearningError, match=r"trajectory 1 .*\(8, 8, 2\).*are \(6, 8, 2\)"):
+        Transitions.collect(
+            tiny_policy(),
+            [chain_trajectory(tiny_policy(), 2, seed=0), chain_trajectory(longer, 2, seed=1)],
+            64,
+        )

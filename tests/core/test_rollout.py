@@ -178,22 +178,38 @@ def test_off_support_share_is_zero_on_the_support_and_rises_away_from_it(
     assert off_support_share(episodes, replace(checkpoint, support=far)) == 1.0
 
 
-def facts(success: float, off: float, upper: float | None = None) -> dict:
-    interval = [0.0, upper if upper is not None else min(1.0, success + 0.05)]
-    return {"success": success, "off_support": off, "n": 200, "intervals": {"success": interval}}
+def facts(successes: int, off: float, n: int = 200) -> dict:
+    interval = list(wilson_interval(successes, n))
+    return {
+        "success": successes / n,
+        "off_support": off,
+        "n": n,
+        "intervals": {"success": interval},
+    }
 
 
 @pytest.mark.parametrize(
     ("before", "after", "passes"),
     [
-        (facts(0.9, 0.02), facts(0.95, 0.02), True),
-        (facts(0.9, 0.02), facts(0.87, 0.04), True),
-        (facts(0.9, 0.02), facts(0.84, 0.02), False),  # fell by more than 5 points
-        (facts(0.9, 0.02), facts(0.88, 0.02, upper=0.89), False),  # surely fell
-        (facts(0.9, 0.02), facts(0.95, 0.06), False),  # left the data
+        (facts(180, 0.02), facts(190, 0.02), True),
+        (facts(180, 0.02), facts(174, 0.04), True),
+        (facts(40, 0.02), facts(30, 0.02), True),  # by 5 points exactly
+        (facts(180, 0.02), facts(169, 0.02), False),  # by more than 5 points
+        # By 4.2 points, more than chance explains: ± 2.5 points at this n.
+        (facts(1140, 0.02, 1200), facts(1090, 0.02, 1200), False),
+        (facts(400, 0.02, 400), facts(400, 0.02, 400), True),  # nothing is lost
+        (facts(100, 0.02, 100), facts(99, 0.02, 100), True),
+        (facts(0, 0.02), facts(0, 0.02), True),
+        (facts(180, 0.02), facts(190, 0.06), False),  # left the data
     ],
 )
 def test_gate_refuses_lost_success_and_drift(before: dict, after: dict, passes: bool) -> None:
     verdict = judge(before, after)
     assert verdict.passed is passes
     assert len(verdict.reasons) == 2
+
+
+@pytest.mark.parametrize("n", [10, 30, 60, 80, 190, 300, 400, 1000])
+def test_interval_of_a_perfect_or_hopeless_count_ends_at_the_rate(n: int) -> None:
+    assert wilson_interval(n, n)[1] == 1.0
+    assert wilson_interval(0, n)[0] == 0.0

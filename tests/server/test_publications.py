@@ -87,15 +87,24 @@ def test_what_cannot_be_published_is_refused_with_the_reason(
         request = RoundRequest(publish_rule=PublishRule.NEVER)
         compared = rounds.launch(session, NOW, campaign_id, request)
         factories.add_checkpoint(session, "compared", parent_id=1, round_id=compared.id)
+        factories.add_checkpoint(session, "pretrained anew")
     for checkpoint_id, status, words in (
         (99, 404, "no checkpoint 99"),
         (1, 409, "checkpoint 1 is published already"),
         (4, 409, "is for task 'stacking'"),
         (5, 409, "comes from comparison round 1"),
+        (6, 409, "descends from 'pretrained anew' (checkpoint 6)"),
     ):
         answer = _publish(world, campaign_id, checkpoint_id)
         assert answer.status_code == status and words in answer.json()["detail"]
     assert _published(world, campaign_id) == 1
+
+
+def test_another_pretrained_policy_can_be_published_before_there_are_runs(world: World) -> None:
+    made, _ = world.add_campaign(pairs=0)
+    with world.database.write() as session:
+        anew = factories.add_checkpoint(session, "pretrained anew").id
+    assert _publish(world, made, anew).status_code == 201
 
 
 def test_the_gate_publishes_without_an_account(world: World, campaign_id: int) -> None:
