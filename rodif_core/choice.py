@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from rodif_core.gate import OFF_SUPPORT_RATIO, OFF_SUPPORT_SLACK
@@ -31,6 +31,17 @@ class Trial:
             "predicted_preferred": self.predicted,
         }
 
+    @classmethod
+    def from_json(cls, facts: Mapping[str, float], policy: DiffusionPolicy) -> Trial:
+        """The trial of `policy` that `to_json` told of."""
+        return cls(
+            facts["scale"],
+            policy,
+            facts["success"],
+            facts["off_support"],
+            facts["predicted_preferred"],
+        )
+
 
 def improves(base: Trial, before: Trial, after: Trial) -> bool:
     """Whether a self-training pass replaces what it started from.
@@ -46,7 +57,8 @@ def choose(base: Trial, trials: Sequence[Trial]) -> Trial:
     """The scale whose rollouts the labels like best, less what leaves the data, among those that
     keep success and support.
 
-    When none keeps both, the one that leaves the data least. Ties go to the smaller scale.
+    When none keeps both, the one with the most success less what leaves the data. Ties go to the
+    smaller scale.
     """
     limit = _off_support_limit(base)
     sound = [

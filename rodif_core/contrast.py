@@ -81,12 +81,13 @@ def contrast(
 def _gate_is_shut(metrics: dict[str, Any], config: FinetuneConfig, update: int) -> str | None:
     if config.method is FinetuneMethod.DP_DPO:
         return None
-    if update == 0 and metrics["outer_slope"] < DEAD_GRADIENT:
+    # The slope is that of the loss; its outer logistic's own is outer_temperature times it.
+    if update == 0 and metrics["outer_slope"] * config.outer_temperature < DEAD_GRADIENT:
         return (
             f"dead gradient: with conservativeness {config.conservativeness} and reduction "
             f"{config.reduction.value!r} the outer slope is {metrics['outer_slope']:.1e} before "
             "the first update; use a conservativeness below 0.5 or reduction 'mean'"
         )
-    if metrics["gate_margin"] > 0 and metrics["outer_slope"] < 0.5:
+    if metrics["gate_margin"] > 0:
         return f"the gate shut at update {update}: mean vote {metrics['mean_vote']:.3f}"
     return None

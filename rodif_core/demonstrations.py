@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import LearningError, TrajectoryFileError, ValueOutOfRangeError
+from rodif_core.npz import read_archive, write_archive
 from rodif_core.tasks import Task
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.tasks.experts import draw_expert
@@ -26,7 +23,8 @@ PARALLEL = 100  # simulations stepped together; changes the time, not the result
 MAX_ATTEMPTS = 20  # draws for one demonstration before we say that something is wrong
 
 _FORMAT = 1
-_ARRAYS = ("observations", "actions", "qpos", "paths")
+_ARRAYS = {"observations": 2, "actions": 2, "qpos": 2, "paths": 2}  # and their number of axes
+_FACTS = {"context", "outcome", "info"}  # of an episode, in the header
 
 
 @dataclass(frozen=True)
@@ -226,33 +224,29 @@ def save_demonstrations(path: Path, demonstrations: Sequence[Trajectory]) -> Non
             for one in demonstrations
         ],
     }
-    text = json.dumps(header, sort_keys=True).encode()
-    arrays = {"header": np.frombuffer(text, dtype=np.uint8)}
-    for name in _ARRAYS:
-        arrays[name] = np.concatenate([getattr(one, name) for one in demonstrations])
-    buffer = io.BytesIO()
-    # numpy's savez stamps the time of day into the archive, so the members are written by hand.
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, array, allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            archive.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED)
-    path.write_bytes(buffer.getvalue())
+    arrays = {
+        name: np.concatenate([getattr(one, name) for one in demonstrations]) for name in _ARRAYS
+    }
+    path.write_bytes(write_archive(header, arrays))
 
 
 def load_demonstrations(path: Path) -> list[Trajectory]:
     """Read a set back; raises TrajectoryFileError when the file is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            header = json.loads(archive["header"].tobytes())
-            columns = {name: archive[name] for name in _ARRAYS}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise TrajectoryFileError(f"{path} is not a readable demonstration set: {error}") from error
-    if header.get("format") != _FORMAT:
-        raise TrajectoryFileError(
-            f"{path} has format {header.get('format')!r}; this version reads {_FORMAT}"
-        )
+        data = path.read_bytes()
+    except OSError as error:
+        raise TrajectoryFileError(f"{path} is not readable: {error}") from error
+    facts = {"lengths": list, "episodes": list}
+    header, columns = read_archive(
+        data, f"the demonstration set {path}", version=_FORMAT, facts=facts, ranks=_ARRAYS
+    )
+    if not all(isinstance(length, int) and length >= 0 for length in header["lengths"]):
+        raise TrajectoryFileError(f"{path}: lengths in its header are not counts")
+    for episode in header["episodes"]:
+        if not isinstance(episode, dict) or not episode.keys() >= _FACTS:
+            raise TrajectoryFileError(
+                f"{path}: an episode in its header is {episode!r}, without {sorted(_FACTS)}"
+            )
     lengths = np.array(header["lengths"], dtype=int)
     for name, column in columns.items():
         rows = int(lengths.sum()) + (0 if name == "actions" else len(lengths))

@@ -56,7 +56,7 @@ def _kept_rows(kept: Path, weights: str, sight: Sight, one: Trajectory) -> NDArr
     file = kept / f"{weights}-{shown}.safetensors"
     if not file.exists():
         rows = torch.from_numpy(sight.rows(one.observations, one.qpos))
-        temporary = file.with_suffix(".partial")
+        temporary = file.with_suffix(f".{os.getpid()}.partial")  # others may encode it just now
         safetensors.torch.save_file({"rows": rows}, temporary)
         os.replace(temporary, file)
     return np.asarray(safetensors.torch.load_file(file)["rows"].numpy())

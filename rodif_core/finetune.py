@@ -7,6 +7,7 @@ CPU: equal arguments give equal weights.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.spec import FinetuneConfig, FinetuneMethod
+from rodif_core.training_state import claim_workspace
 from rodif_core.trajectory import Trajectory
 
 
@@ -29,9 +31,10 @@ from rodif_core.trajectory import Trajectory
 class FinetuneResult:
     """The candidate and what the round stores about its making (JSON types).
 
-    report: method, stopped, curve, kl_winners and kl_losers (nats per decision on the stored
-    states of trajectories that win or lose most of their labels), pairs, trajectories, and for
-    `rodif_guided` scores, trials and the chosen scale.
+    report: method, pairs, ties, trajectories, decisions, kl_winners and kl_losers (nats per
+    decision on the stored states of trajectories that win or lose most of their labels); of the
+    paper's methods curve and stopped; of `rodif_guided` scores, base, trials, self_training and
+    chosen.
     """
 
     checkpoint: Checkpoint
@@ -51,9 +54,11 @@ def finetune(
     """Steer the policy towards the preferred trajectories; the given checkpoint is the reference.
 
     preferences and ties index into trajectories; only `rodif_guided` learns from ties, the
-    paper's methods know none. `workspace` keeps partial state, so that a second call
-    with the same arguments goes on where the first was killed. Raises LearningError without
-    usable labels or when conservativeness is not set (estimate it from the labels first).
+    paper's methods know none. `workspace` keeps partial state, so that a second call with the same
+    arguments goes on where the first was killed: after the last saved update, and for
+    `rodif_guided` after the last finished trial. Raises LearningError without usable labels, when
+    conservativeness is not set (estimate it from the labels first), and for a workspace of another
+    fine-tuning.
     """
     if config.conservativeness is None and config.method is not FinetuneMethod.DP_DPO:
         raise LearningError("conservativeness is not set: estimate it from the labels first")
@@ -61,6 +66,8 @@ def finetune(
     for label in labels:
         if not all(0 <= index < len(trajectories) for index in label.pair):
             raise LearningError(f"{label} names a trajectory outside 0 … {len(trajectories) - 1}")
+    if workspace is not None:
+        claim_workspace(workspace, _identity(checkpoint, trajectories, preferences, ties, config))
     transitions = Transitions.collect(checkpoint.policy, trajectories, config.chunk_rows)
     report: dict[str, Any] = {
         "method": config.method.value,
@@ -86,6 +93,27 @@ def finetune(
     report |= _drift(policy, transitions, preferences, config)
     card = {"kind": "finetuned", "parent": checkpoint.digest, "config": config.to_json()}
     return FinetuneResult(replace(checkpoint, policy=policy, card=card), report)
+
+
+def _identity(
+    checkpoint: Checkpoint,
+    trajectories: Sequence[Trajectory],
+    preferences: Sequence[Preference],
+    ties: Sequence[Tie],
+    config: FinetuneConfig,
+) -> dict[str, Any]:
+    """What decides the candidate, in JSON types."""
+    runs = hashlib.sha256()
+    for one in trajectories:
+        runs.update(one.histories.tobytes() + one.chains.tobytes() + one.paths.tobytes())
+    labels = hashlib.sha256(repr([label.pair for label in preferences]).encode())
+    labels.update(repr([label.pair for label in ties]).encode())
+    return {
+        "parent": checkpoint.digest,
+        "config": config.to_json(),
+        "trajectories": runs.hexdigest()[:16],
+        "labels": labels.hexdigest()[:16],
+    }
 
 
 def _drift(

@@ -13,61 +13,55 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rodif_core.choice import Trial, choose, improves
-from rodif_core.contrast import Progress, contrast
+from rodif_core.contrast import Progress
 from rodif_core.drift import off_support_share
-from rodif_core.errors import LearningError
 from rodif_core.guidance import guide
-from rodif_core.log_ratio import (
-    PairMatrix,
-    Transitions,
-    compute_ratios,
-    mean_ratio_per_trajectory,
-)
+from rodif_core.log_ratio import PairMatrix, Transitions, stack_decisions
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.rollout import rollout
-from rodif_core.scoring import PathFeatures, PathUtility, split_threshold, standardise
-from rodif_core.spec import FinetuneConfig, FinetuneMethod, RolloutConfig, Scorer
+from rodif_core.scoring import PathFeatures
+from rodif_core.spec import (
+    SEEDS_PER_ROUND,
+    SEEDS_PER_USE,
+    SELECTION_SEED,
+    FinetuneConfig,
+    RolloutConfig,
+)
 from rodif_core.tasks import get_task
+from rodif_core.training_state import load_state, save_state
 from rodif_core.trajectory import Trajectory
+from rodif_core.winners import Scores, score
 
-Array = NDArray[np.float64]
-# Rollouts inside a round never share a seed with an evaluation, nor with each other by use.
-SELECTION_SEED, SEEDS_PER_ROUND, SEEDS_PER_USE = 7_000_000, 10_000, 1_000
 IMITATION = 1.0  # guidance scale that only imitates
 
 
 @dataclass(frozen=True, eq=False)
-class Scores:
-    """Utilities of the labelled trajectories, both opinions, and who is kept as a winner."""
+class _Run:
+    """One fine-tuning: what all of its trials share."""
 
-    network: Array
-    gaussian_process: Array
-    used: Array
-    threshold: float
-    kept: list[int]
-    path_utility: PathUtility
-    path_threshold: float
-    network_threshold: float
-    eligible: NDArray[np.bool_]  # (R,): may be a winner
+    checkpoint: Checkpoint
+    scores: Scores
+    config: FinetuneConfig
+    workspace: Path | None
+    progress: Progress | None
 
-    def to_json(self) -> dict[str, Any]:
-        """What the round stores; agreement = share of eligible trajectories that both models
-        place on the same side of their cuts."""
-        network_side = self.network[self.eligible] > self.network_threshold
-        path_side = self.gaussian_process[self.eligible] > self.path_threshold
-        return {
-            "network": [round(float(value), 4) for value in self.network],
-            "gaussian_process": [round(float(value), 4) for value in self.gaussian_process],
-            "agreement": float((network_side == path_side).mean()),
-            "kept": self.kept,
-            "trajectories": len(self.used),
-        }
+    def stage(self, name: str) -> Any:
+        """Progress of one guidance, as `guide` calls it."""
+        progress = self.progress
+        if progress is None:
+            return None
+        return lambda done, of, metrics: progress(name, done / of, metrics)
+
+    def tell(self, stage: str, fraction: float, trial: Trial) -> None:
+        """Progress in what a trial showed."""
+        if self.progress is not None:
+            facts = trial.to_json()
+            self.progress(stage, fraction, {name: facts[name] for name in facts if name != "scale"})
 
 
 def finetune_guided(
@@ -81,30 +75,29 @@ def finetune_guided(
     workspace: Path | None,
     progress: Progress | None,
 ) -> tuple[DiffusionPolicy, dict[str, Any]]:
-    """Score, guide at every scale, choose; optional self-training. Returns policy and report."""
+    """Score, guide at every scale, choose; optional self-training. Returns policy and report.
+
+    `workspace` keeps every finished trial; an unfinished one is begun again.
+    """
     matrix = PairMatrix.build(transitions, preferences, config)
     scores = score(
         checkpoint, trajectories, preferences, transitions, matrix, config,
         ties=ties, workspace=workspace, progress=progress,
     )  # fmt: skip
-    histories, chunks = _kept_decisions(transitions, scores.kept)
-    base = _try(checkpoint, checkpoint.policy, 0.0, scores, config)
+    this = _Run(checkpoint, scores, config, workspace, progress)
+    base = _try(this, "base", checkpoint.policy, 0.0)
     trials: list[Trial] = []
     for scale in config.guide.scales:
-        policy = guide(
-            checkpoint.policy, histories, chunks, scale, config.guide, config.seed,
-            _stage(progress, f"guide s={scale:g}"),
-        )  # fmt: skip
-        trials.append(_try(checkpoint, policy, scale, scores, config))
-        _tell(progress, "choose", len(trials) / len(config.guide.scales), trials[-1])
+        trials.append(_guide(this, transitions, scale))
+        this.tell("choose", len(trials) / len(config.guide.scales), trials[-1])
     chosen = choose(base, trials)
     retrained: list[Trial] = []
     for extra in range(config.guide.self_training_rounds):
-        fresh = _self_train(checkpoint, base, chosen, scores, config, extra, progress)
+        fresh = _self_train(this, base, chosen, extra)
         if fresh is None:
             break
         retrained.append(fresh)
-        _tell(progress, "choose again", (extra + 1) / config.guide.self_training_rounds, fresh)
+        this.tell("choose again", (extra + 1) / config.guide.self_training_rounds, fresh)
         chosen = fresh if improves(base, chosen, fresh) else chosen
     report = {
         "scores": scores.to_json(),
@@ -116,56 +109,18 @@ def finetune_guided(
     return chosen.policy, report
 
 
-def score(
-    checkpoint: Checkpoint,
-    trajectories: Sequence[Trajectory],
-    preferences: Sequence[Preference],
-    transitions: Transitions,
-    matrix: PairMatrix,
-    config: FinetuneConfig,
-    *,
-    ties: Sequence[Tie] = (),
-    workspace: Path | None = None,
-    progress: Progress | None = None,
-) -> Scores:
-    """Utilities from both models; winners lie above the cut of the configured one."""
-    scorer = replace(config, method=FinetuneMethod.RODIF, updates=config.guide.score_updates)
-    moved = contrast(
-        checkpoint.policy, transitions, matrix, scorer,
-        stage="score", workspace=workspace, progress=progress,
+def _guide(this: _Run, transitions: Transitions, scale: float) -> Trial:
+    """Move towards the kept trajectories' decisions by one scale."""
+    name = f"guide s={scale:g}"
+    done = _load_trial(this, name)
+    if done is not None:
+        return done
+    histories, chunks = _kept_decisions(transitions, this.scores.kept)
+    policy = guide(
+        this.checkpoint.policy, histories, chunks, scale, this.config.guide, this.config.seed,
+        this.stage(name),
     )  # fmt: skip
-    ratios = compute_ratios(moved.policy, transitions, config)
-    network = np.asarray(mean_ratio_per_trajectory(ratios, transitions))
-    path_utility = PathUtility.fit(
-        PathFeatures.of(trajectories, get_task(checkpoint.task)), preferences, ties
-    )
-    opinions = {
-        Scorer.NETWORK: standardise(network),
-        Scorer.GAUSSIAN_PROCESS: standardise(path_utility.utilities),
-        Scorer.COMBINED: standardise(network) + standardise(path_utility.utilities),
-    }
-    used = opinions[config.guide.scorer]
-    # Failures are out of the question as winners; the cut runs between the others.
-    success = np.array([trajectory.success for trajectory in trajectories])
-    eligible = success | (not config.guide.require_success)
-    if eligible.sum() < 2:
-        raise LearningError(
-            f"{int(eligible.sum())} of {len(eligible)} labelled trajectories succeeded; "
-            "guidance needs at least 2: collect more episodes"
-        )
-    threshold = split_threshold(used[eligible])
-    kept = np.flatnonzero(eligible & (used > threshold)).tolist()
-    return Scores(
-        network,
-        path_utility.utilities,
-        used,
-        threshold,
-        kept,
-        path_utility,
-        split_threshold(path_utility.utilities[eligible]),
-        split_threshold(network[eligible]),
-        eligible,
-    )
+    return _try(this, name, policy, scale)
 
 
 def _kept_decisions(transitions: Transitions, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -173,28 +128,41 @@ def _kept_decisions(transitions: Transitions, kept: Sequence[int]) -> tuple[Tens
     return transitions.histories[rows], transitions.chains[rows, -1]
 
 
-def _try(
-    checkpoint: Checkpoint,
-    policy: DiffusionPolicy,
-    scale: float,
-    scores: Scores,
-    config: FinetuneConfig,
-) -> Trial:
-    """Fresh rollouts of a policy; all trials of a round use the same seeds."""
-    settings = RolloutConfig(config.guide.selection_rollouts, _fresh_seed(config))
-    rollouts = rollout(replace(checkpoint, policy=policy), settings)
-    off = off_support_share(rollouts, checkpoint)
+def _try(this: _Run, name: str, policy: DiffusionPolicy, scale: float) -> Trial:
+    """Fresh rollouts of a policy; all trials of a round use the same seeds. Keeps the trial."""
+    done = _load_trial(this, name)
+    if done is not None:
+        return done
+    settings = RolloutConfig(this.config.guide.selection_rollouts, _fresh_seed(this.config))
+    rollouts = rollout(replace(this.checkpoint, policy=policy), settings)
+    off = off_support_share(rollouts, this.checkpoint)
     success = float(np.mean([trajectory.success for trajectory in rollouts]))
-    liked = _liked(checkpoint, rollouts, scores)
-    return Trial(scale, policy, success, off, len(liked) / len(rollouts))
+    liked = _liked(this, rollouts)
+    trial = Trial(scale, policy, success, off, len(liked) / len(rollouts))
+    if this.workspace is not None:
+        modules = {"denoiser": policy.denoiser}
+        save_state(_trial_file(this.workspace, name), modules, None, trial.to_json())
+    return trial
 
 
-def _liked(
-    checkpoint: Checkpoint, rollouts: Sequence[Trajectory], scores: Scores
-) -> list[Trajectory]:
+def _load_trial(this: _Run, name: str) -> Trial | None:
+    """What an earlier attempt at the same fine-tuning has finished."""
+    if this.workspace is None:
+        return None
+    policy = this.checkpoint.policy.copy()
+    modules = {"denoiser": policy.denoiser}
+    facts = load_state(_trial_file(this.workspace, name), modules, None)
+    return None if facts is None else Trial.from_json(facts, policy)
+
+
+def _trial_file(workspace: Path, name: str) -> Path:
+    return workspace / f"{name.replace(' ', '-')}.safetensors"
+
+
+def _liked(this: _Run, rollouts: Sequence[Trajectory]) -> list[Trajectory]:
     """The rollouts that succeed and that the labels predict to be preferred."""
-    features = PathFeatures.of(rollouts, get_task(checkpoint.task))
-    predicted = scores.path_utility.predict(features) > scores.path_threshold
+    features = PathFeatures.of(rollouts, get_task(this.checkpoint.task))
+    predicted = this.scores.path_utility.predict(features) > this.scores.path_cut
     pairs = zip(rollouts, predicted, strict=True)
     return [trajectory for trajectory, preferred in pairs if preferred and trajectory.success]
 
@@ -203,15 +171,7 @@ def _fresh_seed(config: FinetuneConfig, use: int = 0) -> int:
     return SELECTION_SEED + SEEDS_PER_ROUND * config.seed + SEEDS_PER_USE * use
 
 
-def _self_train(
-    checkpoint: Checkpoint,
-    base: Trial,
-    chosen: Trial,
-    scores: Scores,
-    config: FinetuneConfig,
-    extra: int,
-    progress: Progress | None,
-) -> Trial | None:
+def _self_train(this: _Run, base: Trial, chosen: Trial, extra: int) -> Trial | None:
     """Imitate the chosen policy's own liked rollouts near the data, made with less noise than it
     has itself.
 
@@ -219,21 +179,25 @@ def _self_train(
     it wavers less and still takes many ways, and imitation makes that its own. Its scale is 1: the
     policy is where it should go, and pushing on costs success. None: no rollout was liked.
     """
-    guiding = config.guide
-    settings = RolloutConfig(guiding.self_training_rollouts, _fresh_seed(config, extra + 1))
+    name = f"self-training {extra + 1}"
+    done = _load_trial(this, name)
+    if done is not None:
+        return done
+    checkpoint, guiding = this.checkpoint, this.config.guide
+    settings = RolloutConfig(guiding.self_training_rollouts, _fresh_seed(this.config, extra + 1))
     steady = rollout(
         replace(checkpoint, policy=chosen.policy), settings, noise_scale=guiding.self_training_noise
     )
-    liked = near_data(checkpoint, _liked(checkpoint, steady, scores), base.off_support)
+    liked = near_data(checkpoint, _liked(this, steady), base.off_support)
     if not liked:
         return None
-    lessons = Transitions.collect(checkpoint.policy, liked, config.chunk_rows)
+    histories, chains = stack_decisions(checkpoint.policy, liked)
     policy = guide(
-        chosen.policy, lessons.histories, lessons.chains[:, -1], IMITATION,
+        chosen.policy, histories, chains[:, -1], IMITATION,
         replace(guiding, updates=guiding.self_training_updates),
-        config.seed + extra + 1, _stage(progress, f"self-training {extra + 1}"),
+        this.config.seed + extra + 1, this.stage(name),
     )  # fmt: skip
-    return _try(checkpoint, policy, chosen.scale, scores, config)
+    return _try(this, name, policy, chosen.scale)
 
 
 def near_data(
@@ -247,15 +211,3 @@ def near_data(
     order = np.argsort(off, kind="stable")
     count = max(sum(share <= limit for share in off), (len(off) + 1) // 2)
     return [trajectories[i] for i in sorted(order[:count].tolist())]
-
-
-def _tell(progress: Progress | None, stage: str, fraction: float, trial: Trial) -> None:
-    if progress is not None:
-        facts = trial.to_json()
-        progress(stage, fraction, {name: facts[name] for name in facts if name != "scale"})
-
-
-def _stage(progress: Progress | None, name: str) -> Any:
-    if progress is None:
-        return None
-    return lambda done, of, metrics: progress(name, done / of, metrics)

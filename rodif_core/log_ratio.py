@@ -47,15 +47,9 @@ class Transitions:
     ) -> Transitions:
         """Stack the trajectories and cache the reference means.
 
-        Raises LearningError for trajectories without decisions, or with decisions of another
-        shape than the reference's.
+        Raises LearningError as `stack_decisions` does.
         """
-        if not trajectories or any(len(t.decision_steps) == 0 for t in trajectories):
-            raise LearningError("fine-tuning needs trajectories with denoising chains, got none")
-        _check_shapes(reference, trajectories)
-        histories = np.concatenate([trajectory.histories for trajectory in trajectories])
-        chains = torch.from_numpy(np.concatenate([t.chains for t in trajectories]))
-        normalised = reference.normaliser.observation(torch.from_numpy(histories))
+        normalised, chains = stack_decisions(reference, trajectories)
         counts = [len(trajectory.decision_steps) for trajectory in trajectories]
         starts = (0, *np.cumsum(counts).tolist())
         with torch.no_grad():
@@ -68,6 +62,23 @@ class Transitions:
     def steps_of(self, trajectory: int) -> range:
         """Rows of one trajectory."""
         return range(self.starts[trajectory], self.starts[trajectory + 1])
+
+
+def stack_decisions(
+    reference: DiffusionPolicy, trajectories: Sequence[Trajectory]
+) -> tuple[Tensor, Tensor]:
+    """histories (N, To, O) and chains (N, K + 1, Tp, A) of all decisions, both normalised.
+
+    Raises LearningError for trajectories without decisions, or with decisions of another shape
+    than the reference's.
+    """
+    if not trajectories or any(len(t.decision_steps) == 0 for t in trajectories):
+        raise LearningError("fine-tuning needs trajectories with denoising chains, got none")
+    _check_shapes(reference, trajectories)
+    histories = np.concatenate([trajectory.histories for trajectory in trajectories])
+    chains = np.concatenate([trajectory.chains for trajectory in trajectories])
+    normalised = reference.normaliser.observation(torch.from_numpy(histories))
+    return normalised, torch.from_numpy(chains)
 
 
 def _check_shapes(reference: DiffusionPolicy, trajectories: Sequence[Trajectory]) -> None:

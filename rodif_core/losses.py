@@ -31,7 +31,8 @@ class LossOutput(NamedTuple):
     """The scalar loss and what to log about it.
 
     metrics: loss, mean_vote, outvoted (share of votes below 0.1) and, for RoDiF, gate_margin
-    (how far the votes are past the threshold) and outer_slope (|dL/dΣV̂|, 0 = the gate is shut).
+    (how far the votes are past the threshold; with groups, those of the last one to pass it) and
+    outer_slope (|dL/dΣV̂|, 0 = the gate is shut; with groups, of the widest open one).
     """
 
     loss: Tensor
@@ -88,7 +89,7 @@ def rodif_loss(
     loss = -F.logsigmoid(margins / outer_temperature).sum()
     slope = torch.sigmoid(-margins / outer_temperature) / outer_temperature
     metrics = _metrics(loss, delta_q, weights, vote_temperature)
-    metrics["gate_margin"] = float(margins.detach().sum())
+    metrics["gate_margin"] = float(margins.detach().min())
     metrics["outer_slope"] = float(slope.detach().max())
     return LossOutput(loss, metrics)
 

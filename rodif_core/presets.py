@@ -48,8 +48,12 @@ class PretrainConfig:
     def __post_init__(self) -> None:
         if not 0 < self.held_out < 0.5:
             raise ValueOutOfRangeError("held_out", self.held_out, "in (0, 0.5)")
-        least = {"updates": 1, "round_updates": 1, "recoveries": 1, "rounds": 0}
-        for name, value in least.items():
+        if not 0 < self.learning_rate <= 1:
+            raise ValueOutOfRangeError("learning_rate", self.learning_rate, "in (0, 1]")
+        if not 0 <= self.ema_decay < 1:
+            raise ValueOutOfRangeError("ema_decay", self.ema_decay, "in [0, 1)")
+        least = {"updates": 1, "round_updates": 1, "recoveries": 1, "rounds": 0, "batch_size": 1}
+        for name, value in (least | {"warm_up": 0, "weight_decay": 0}).items():
             if getattr(self, name) < value:
                 raise ValueOutOfRangeError(name, getattr(self, name), f"at least {value}")
 

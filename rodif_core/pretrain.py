@@ -93,8 +93,8 @@ def pretrain(
     precision  of the forward passes; by default mixed on a GPU
 
     The result holds the averaged weights, the normaliser and the support set. Raises
-    LearningError when the loss is not finite or the workspace belongs to another training, and
-    UnknownNameError for a device that is not there.
+    LearningError for fewer than two demonstrations, when the loss is not finite or the workspace
+    belongs to another training, and UnknownNameError for a device that is not there.
     """
     check_device(device)
     precision = precision or usual_precision(device)
@@ -134,7 +134,15 @@ def pretrain(
 def _split(
     demonstrations: Sequence[Trajectory], config: PretrainConfig
 ) -> tuple[list[Trajectory], list[Trajectory]]:
-    """Those to train on, and those that are held out."""
+    """Those to train on, and those that are held out.
+
+    Drawn afresh for every training: one that goes on from another policy may hold out what that
+    policy was trained on, and its held-out loss then says little.
+    """
+    if len(demonstrations) < 2:
+        raise LearningError(
+            f"{len(demonstrations)} demonstrations: training needs at least 2, as one is held out"
+        )
     count = max(1, int(len(demonstrations) * config.held_out))
     order = np.random.default_rng([config.seed, 0]).permutation(len(demonstrations))
     shuffled = [demonstrations[i] for i in order]

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from rodif_core.diffusion.chain import noise_entries
-from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.errors import LearningError, ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint
-from rodif_core.policies.policy import DiffusionPolicy
+from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig
 from rodif_core.sight import Sight
 from rodif_core.spec import RolloutConfig
 from rodif_core.tasks import get_task
@@ -38,7 +38,8 @@ def rollout(
     """Run `config.episodes` episodes; episode i draws start and policy noise from seed + i.
 
     noise_scale in [0, 1] shrinks the noise between denoising steps: 1 samples the policy, less
-    makes it more decided. The same arguments give the same bits on the same machine.
+    makes it more decided. The same arguments give the same bits on the same machine. Raises
+    LearningError when the policy's actions are not finite.
     """
     if not 0 <= noise_scale <= 1:
         raise ValueOutOfRangeError("noise_scale", noise_scale, "in [0, 1]")
@@ -122,7 +123,7 @@ def _rollout_batch(
     outcomes = env.outcomes()
     digest = checkpoint.digest  # hashes all weights
     return [
-        _finish(record, digest, task, seed, context, outcome, noise_scale)
+        _finish(record, digest, task, size, seed, context, outcome, noise_scale)
         for record, seed, context, outcome in zip(records, seeds, contexts, outcomes, strict=True)
     ]
 
@@ -147,6 +148,8 @@ def _decide(
     noise = torch.stack([torch.randn(shape, generator=generators[i]) for i in active])
     noise[:, 1:] *= noise_scale  # the first entry is a^K, where the chain begins
     actions, chains = policy.act(torch.from_numpy(histories), noise)
+    if not bool(chains.isfinite().all()):
+        raise LearningError("the policy's action chunks are not finite: its weights are damaged")
     chunks[active] = actions.numpy()
     for row, i in enumerate(active):
         records[i].decide(histories[row], chains[row].numpy().copy())
@@ -156,18 +159,23 @@ def _finish(
     record: _Recorder,
     digest: str,
     task: Task,
+    size: PolicyConfig,
     seed: int,
     context: dict[str, Any],
     outcome: dict[str, Any],
     noise_scale: float,
 ) -> Trajectory:
+    # An episode whose physics diverged before the first decision has none.
+    histories = np.array(record.histories, dtype=np.float32)
+    chains = np.array(record.chains, dtype=np.float32)
+    chunk = (size.denoising_steps + 1, size.predicted_steps, size.action_dim)
     return Trajectory(
         observations=np.stack(record.observations),
         actions=np.array(record.actions, dtype=np.float32).reshape(-1, task.action_dim),
         qpos=np.stack(record.qpos),
         paths=np.stack(record.paths),
-        histories=np.stack(record.histories),
-        chains=np.stack(record.chains),
+        histories=histories.reshape(-1, size.observation_steps, size.observation_dim),
+        chains=chains.reshape(-1, *chunk),
         decision_steps=np.asarray(record.decision_steps, dtype=np.int32),
         context=context,
         outcome=outcome,

@@ -45,7 +45,9 @@ class Sight:
             self._camera = Camera(task, config.images.pixels, config.images.pixels)
         if given != wanted:
             raise ValueOutOfRangeError(
-                "observation dims of the policy", given, f"{wanted}, as task {task.name.value!r}"
+                "observation dims of the policy",
+                given,
+                f"{wanted}, as task {task.name.value!r} has",
             )
 
     def rows(

@@ -1,20 +1,20 @@
 """Names and configurations that every room of the house shares. Imports neither torch nor mujoco.
 
-All configurations are frozen, checked when they are made, and survive a trip through JSON
-(`to_json` / `from_json`), so that a round can store exactly what it ran with.
+All configurations are frozen, their ranges are checked when they are made, and they survive a trip
+through JSON (`to_json` / `from_json`, which also checks types), so that a round can store exactly
+what it ran with.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Self, TypeVar
+from typing import TypeVar
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.json_config import JsonConfig
 
 
 class TaskName(StrEnum):
@@ -65,8 +65,14 @@ class Scorer(StrEnum):
 
     NETWORK = "network"  # a few RoDiF updates on a throw-away copy; mean log-ratio
     GAUSSIAN_PROCESS = "gaussian_process"  # Bradley-Terry with a Gaussian-process prior on the path
-    COMBINED = "combined"  # mean of both, each standardised
+    COMBINED = "combined"  # sum of both, each standardised
 
+
+# Seeds of episodes. A fine-tuning of seed s rolls out from SELECTION_SEED + SEEDS_PER_ROUND · s on,
+# each of its uses from SEEDS_PER_USE further on, and stays below the seeds of evaluations.
+SELECTION_SEED, SEEDS_PER_ROUND, SEEDS_PER_USE = 7_000_000, 10_000, 1_000
+EVALUATION_SEED = 1_000_000_000
+LARGEST_SEED = (EVALUATION_SEED - SELECTION_SEED) // SEEDS_PER_ROUND - 1  # of a fine-tuning
 
 NameT = TypeVar("NameT", bound=StrEnum)
 
@@ -84,33 +90,13 @@ def _require(holds: bool, name: str, value: object, legal: str) -> None:
         raise ValueOutOfRangeError(name, value, legal)
 
 
-class _JsonConfig:
-    """Mapping to and from plain JSON types for the frozen configurations below."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain dict of JSON types; `from_json` gives back an equal object."""
-        assert dataclasses.is_dataclass(self)
-        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
-        return plain
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Self:
-        """Build and check; raises UnknownNameError for a field that does not exist."""
-        assert dataclasses.is_dataclass(cls)
-        names = [item.name for item in dataclasses.fields(cls)]
-        for key in data:
-            if key not in names:
-                raise UnknownNameError(f"{cls.__name__} field", key, names)
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
-
-
 @dataclass(frozen=True)
-class GuideConfig(_JsonConfig):
+class GuideConfig(JsonConfig):
     """Second half of `rodif_guided`: how the kept trajectories move the policy."""
 
     scorer: Scorer = Scorer.GAUSSIAN_PROCESS
     score_updates: int = 4  # full-batch RoDiF updates of the throw-away copy
-    scales: tuple[float, ...] = (1.0, 2.0)  # guidance scales tried, the gate picks one
+    scales: tuple[float, ...] = (1.0, 2.0)  # guidance scales tried; fresh rollouts pick one
     updates: int = 150
     learning_rate: float = 1e-4
     batch_size: int = 256
@@ -141,7 +127,8 @@ class GuideConfig(_JsonConfig):
         _require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
         _require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
         for name in ("selection_rollouts", "self_training_rollouts"):
-            _require(getattr(self, name) >= 10, name, getattr(self, name), "at least 10")
+            value = getattr(self, name)
+            _require(10 <= value <= SEEDS_PER_USE, name, value, f"10 … {SEEDS_PER_USE}")
         _require(
             0 <= self.self_training_rounds <= 5,
             "self_training_rounds",
@@ -151,7 +138,7 @@ class GuideConfig(_JsonConfig):
 
 
 @dataclass(frozen=True)
-class FinetuneConfig(_JsonConfig):
+class FinetuneConfig(JsonConfig):
     """Everything a fine-tuning round can be told; stored with the round.
 
     Defaults are the paper's Avoid column (Table hyperparameters) where it gives a value.
@@ -198,16 +185,18 @@ class FinetuneConfig(_JsonConfig):
         )
         for name in ("updates", "chunk_rows", "group_size"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        _require(0 <= self.seed < 2**63, "seed", self.seed, "in [0, 2^63)")
+        _require(0 <= self.seed <= LARGEST_SEED, "seed", self.seed, f"0 … {LARGEST_SEED}")
 
 
 @dataclass(frozen=True)
-class RolloutConfig(_JsonConfig):
+class RolloutConfig(JsonConfig):
     """A batch of rollouts: episode i uses seed `seed + i` for its start and its policy noise."""
 
     episodes: int = 100
     seed: int = 0
-    max_parallel: int = 128  # simulations stepped together; memory only, not the result
+    # Simulations stepped together: memory and time. The network rounds otherwise with other rows
+    # beside it, so paths differ in their last digits.
+    max_parallel: int = 128
 
     def __post_init__(self) -> None:
         _require(1 <= self.episodes <= 100_000, "episodes", self.episodes, "1 … 100000")

@@ -1,7 +1,7 @@
 """What training loops share: rate, precision, and partial state on disk for a killed run to go on.
 
 One safetensors file (parameters, averages, Adam moments) with a JSON header; written to a
-temporary file and renamed, so a kill in the middle leaves the older state.
+temporary file, flushed and renamed, so a kill or a power cut in the middle leaves the older state.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import safetensors.torch
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from rodif_core.errors import LearningError, UnknownNameError
@@ -73,8 +73,11 @@ def claim_workspace(workspace: Path, training: dict[str, Any]) -> None:
     if not file.exists():
         temporary = file.with_suffix(".partial")
         temporary.write_text(json.dumps(here, indent=1, sort_keys=True))
-        os.replace(temporary, file)
-    there = json.loads(file.read_text())
+        _put(temporary, file)
+    try:
+        there = json.loads(file.read_text())
+    except ValueError as error:
+        raise _damaged(file, error) from error
     differing = [
         f"{name} is {there.get(name)!r} there and {here.get(name)!r} here"
         for name in sorted(there.keys() | here.keys())
@@ -88,36 +91,61 @@ def claim_workspace(workspace: Path, training: dict[str, Any]) -> None:
 
 
 def save_state(
-    path: Path, modules: dict[str, nn.Module], optimizer: torch.optim.Optimizer, facts: Any
+    path: Path,
+    modules: dict[str, nn.Module],
+    optimizer: torch.optim.Optimizer | None,
+    facts: Any,
 ) -> None:
-    """Write the weights of all modules, the optimizer's moments and JSON facts."""
+    """Write the weights of all modules, the optimizer's moments and JSON facts.
+
+    Raises LearningError, and leaves the older state, when a weight is not finite: going on from
+    such a state could never end well.
+    """
     tensors: dict[str, Tensor] = {}
     for label, module in modules.items():
         for name, value in module.state_dict().items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise LearningError(
+                    f"the weights of {label} are not finite any more ({name}); {path} keeps what "
+                    "was before, if anything: train with a lower learning rate"
+                )
             tensors[f"{label}/{name}"] = value.detach().cpu().clone()
-    for index, moments in optimizer.state_dict()["state"].items():
-        for name, value in moments.items():
+    moments = {} if optimizer is None else optimizer.state_dict()["state"]
+    for index, values in moments.items():
+        for name, value in values.items():
             tensors[f"optimizer/{index}/{name}"] = torch.as_tensor(value).detach().cpu().clone()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".partial")
     safetensors.torch.save_file(tensors, temporary, metadata={"facts": json.dumps(facts)})
-    os.replace(temporary, path)
+    _put(temporary, path)
 
 
 def load_state(
-    path: Path, modules: dict[str, nn.Module], optimizer: torch.optim.Optimizer
+    path: Path, modules: dict[str, nn.Module], optimizer: torch.optim.Optimizer | None
 ) -> Any | None:
-    """Restore what `save_state` wrote and return its facts; None when there is no such file."""
+    """Restore what `save_state` wrote and return its facts; None when there is no such file.
+
+    Raises LearningError for a damaged file, or one of other modules.
+    """
     if not path.exists():
         return None
-    with safe_open(str(path), framework="pt") as file:
-        facts = json.loads(file.metadata()["facts"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    for label, module in modules.items():
-        prefix = f"{label}/"
-        module.load_state_dict(
-            {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
-        )
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            facts = json.loads(file.metadata()["facts"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        for label, module in modules.items():
+            prefix = f"{label}/"
+            module.load_state_dict(
+                {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+            )
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise _damaged(path, error) from error
+    if optimizer is not None:
+        _restore_moments(optimizer, tensors)
+    return facts
+
+
+def _restore_moments(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         if name.startswith("optimizer/"):
@@ -125,4 +153,14 @@ def load_state(
             state.setdefault(int(index), {})[key] = value
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
-    return facts
+
+
+def _put(temporary: Path, file: Path) -> None:
+    """Rename, once the bytes are on the disk."""
+    with temporary.open("rb") as written:
+        os.fsync(written.fileno())
+    os.replace(temporary, file)
+
+
+def _damaged(file: Path, error: Exception) -> LearningError:
+    return LearningError(f"{file} is no readable partial state ({error}); delete it to begin anew")

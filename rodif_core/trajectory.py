@@ -6,10 +6,6 @@ Tp predicted chunk, O observation dims, A action dims, Q position dims of the ph
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,17 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import TrajectoryFileError
+from rodif_core.npz import read_archive, write_archive
 
 FORMAT_VERSION = 1
-_ARRAYS = (
-    "observations",
-    "actions",
-    "qpos",
-    "paths",
-    "histories",
-    "chains",
-    "decision_steps",
-)
+_ARRAYS = {  # and their number of axes
+    "observations": 2,
+    "actions": 2,
+    "qpos": 2,
+    "paths": 2,
+    "histories": 3,
+    "chains": 4,
+    "decision_steps": 1,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,36 +88,17 @@ class Trajectory:
             "outcome": self.outcome,
             "info": self.info,
         }
-        header = np.frombuffer(json.dumps(meta, sort_keys=True).encode(), dtype=np.uint8)
-        arrays = {"header": header} | {name: getattr(self, name) for name in _ARRAYS}
-        buffer = io.BytesIO()
-        # numpy's own savez stamps the time of day into the archive, but equal episodes
-        # must be equal bytes.
-        with zipfile.ZipFile(buffer, "w") as archive:
-            for name, array in arrays.items():
-                member = io.BytesIO()
-                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
-                entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-                archive.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED)
-        return buffer.getvalue()
+        return write_archive(meta, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Trajectory:
         """Read the file form; raises TrajectoryFileError when it is damaged or foreign."""
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                meta = json.loads(archive["header"].tobytes())
-                arrays = {name: archive[name] for name in _ARRAYS}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise TrajectoryFileError(
-                f"not a readable episode file ({len(data)} bytes): {error}"
-            ) from error
-        if meta.get("format") != FORMAT_VERSION:
-            raise TrajectoryFileError(
-                f"episode file has format {meta.get('format')!r};"
-                f" this version reads {FORMAT_VERSION}"
-            )
-        return cls(**arrays, context=meta["context"], outcome=meta["outcome"], info=meta["info"])
+        facts = {"context": dict, "outcome": dict, "info": dict}
+        meta, arrays = read_archive(
+            data, "the episode file", version=FORMAT_VERSION, facts=facts, ranks=_ARRAYS
+        )
+        context, outcome, info = (meta[name] for name in facts)
+        return cls(**arrays, context=context, outcome=outcome, info=info)
 
 
 def episode_without_decisions(

@@ -17,7 +17,7 @@ import numpy as np
 from rodif_core.policies.checkpoint import load_checkpoint
 from rodif_core.preferences.pairs import CROSS_GROUP, Preference, Tie, choose_pairs
 from rodif_core.rollout import rollout
-from rodif_core.scoring import PathFeatures, PathUtility, split_threshold
+from rodif_core.scoring import PathFeatures, PathUtility
 from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import RolloutConfig, TaskName
 from rodif_core.tasks import get_task
@@ -53,9 +53,9 @@ def main() -> None:
         preferences, ties = _ask(truth, groups, sizes, args.flip_rate, args.confused, rng)
         counts.append((len(preferences), len(ties)))
         for name, used in zip(kept, ([], ties), strict=True):
-            utilities = PathUtility.fit(features, preferences, used).utilities
-            cut = split_threshold(utilities[features.success])
-            kept[name].append(features.success & (utilities > cut))
+            fit = PathUtility.fit(features, preferences, used)
+            cut = fit.cut(features.success)
+            kept[name].append(features.success & (fit.utilities > cut))
     judged, tied = np.mean(counts, axis=0)
     print(f"{judged:.0f} preferences and {tied:.0f} ties a draw, {args.draws} draws")
     for name, draws in kept.items():

@@ -13,10 +13,10 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
+from rodif_core.spec import EVALUATION_SEED
 from server.checkpoints import pretrained_by_task, task_facts
 from server.errors import ConflictError, NotFoundError
 from server.publications import record_start
-from server.rounds import EVALUATION_SEED
 from server.snapshots import new_labels_since_round
 from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs

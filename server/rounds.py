@@ -13,9 +13,8 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from rodif_core.spec import FinetuneConfig
+from rodif_core.spec import EVALUATION_SEED, FinetuneConfig
 from server.errors import ConflictError, NotFoundError
-from server.finetune_config import complete_config
 from server.snapshots import new_labels_since_round, snapshot_to_learn_from
 from server.states import (
     JobKind,
@@ -52,9 +51,6 @@ _STATE_OF_RETRIED: dict[JobKind, RoundState] = {
     JobKind.EVALUATE: RoundState.EVALUATING,
     JobKind.PUBLISH: RoundState.GATING,
 }
-# Evaluations share their seeds, so that a parent is evaluated once and compared like with like;
-# collect jobs count up from 0 and stay far below.
-EVALUATION_SEED = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -92,6 +88,8 @@ def launch(
     if publish_rule != PublishRule.NEVER:
         _refuse_second_publishing_round(session, campaign_id)
     snapshot = snapshot_to_learn_from(session, now, campaign_id, request.snapshot_digest)
+    # Evaluations share their seeds, so that a parent is evaluated once and compared like with like;
+    # collect jobs count up from 0 and stay far below.
     evaluation = {"episodes": settings["evaluation_episodes"], "seed": EVALUATION_SEED}
     new_round = Round(
         campaign_id=campaign_id,
@@ -143,7 +141,7 @@ def _config(request: RoundRequest, *, method: str) -> FinetuneConfig:
     partial = dict(request.config or {})
     if request.seed is not None:
         partial["seed"] = request.seed
-    return complete_config(partial, method=method)
+    return FinetuneConfig.from_json({"method": method, **partial})
 
 
 def _refuse_second_publishing_round(session: Session, campaign_id: int) -> None:

@@ -85,6 +85,8 @@ def load_checkpoint(data: bytes) -> Checkpoint:
         tensors = safetensors.torch.load(data)
         size = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["rodif"])
+        if not isinstance(header, dict):
+            raise CheckpointFileError(f"checkpoint header is a {type(header).__name__}")
         checkpoint = _rebuild(tensors, header)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointFileError(

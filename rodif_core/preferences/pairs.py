@@ -20,11 +20,10 @@ STRATEGIES = (CROSS_GROUP, RANDOM)
 
 @dataclass(frozen=True)
 class Preference:
-    """One decisive label: `annotator` holds trajectory `winner` above trajectory `loser`."""
+    """One decisive label: somebody holds trajectory `winner` above trajectory `loser`."""
 
     winner: int
     loser: int
-    annotator: int = 0
 
     @property
     def pair(self) -> tuple[int, int]:

@@ -116,6 +116,8 @@ class AvoidTask(Task):
         return point
 
     def group_of(self, mode: str) -> str:
+        if mode not in self.modes:
+            raise UnknownNameError("mode", mode, self.modes)
         return self.groups["LR".index(mode[0])]
 
     def move(self, setpoints: Array, actions: Array) -> Array:

@@ -7,11 +7,13 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from rodif_core.spec import LARGEST_SEED
 from server.schemas.campaigns import PublishRuleIn
 from server.schemas.common import MAX_SEED, In, Out
 from server.states import JobKind, JobState, PublishRule, RoundState, RoundTrigger
 
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+FinetuneSeed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
@@ -29,7 +31,7 @@ class RoundCreate(In):
     publish_rule: PublishRuleIn | None = None
     evaluation: EvaluationRequest | None = None
     snapshot_digest: Digest | None = None
-    seed: Seed | None = None
+    seed: FinetuneSeed | None = None
 
 
 class RoundOut(Out):

@@ -184,7 +184,7 @@ def test_demos_writes_a_set_that_plot_can_draw(
 def test_plot_of_a_foreign_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = ["--out", str(tmp_path / "x.png")]
     assert main(["plot", "modes", str(tmp_path / "none.npz"), *out]) == 1
-    assert "not a readable demonstration set" in capsys.readouterr().err
+    assert "is not readable" in capsys.readouterr().err
     assert main(["plot", "modes", "juggling", *out]) == 1
     assert "'juggling' is neither a readable file" in capsys.readouterr().err
 

@@ -231,7 +231,7 @@ def test_a_missing_or_damaged_set_is_refused(tmp_path: Path, balanced: list[Traj
     whole = path.read_bytes()
     for damaged in (b"", b"text", whole[: len(whole) // 2], b"x" + whole[1:-200]):
         path.write_bytes(damaged)
-        with pytest.raises(TrajectoryFileError, match="not a readable demonstration set"):
+        with pytest.raises(TrajectoryFileError, match="demonstration set .* is not readable"):
             load_demonstrations(path)
 
 
@@ -247,6 +247,27 @@ def test_a_set_whose_arrays_do_not_match_its_header_is_refused(
         load_demonstrations(path)
     np.savez(path, **{**arrays, "header": np.frombuffer(b'{"format": 9}', np.uint8)})
     with pytest.raises(TrajectoryFileError, match="format 9; this version reads 1"):
+        load_demonstrations(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (b"[1]", "a list as header"),
+        (b'{"format": 1, "lengths": 3, "episodes": []}', "lengths in its header is 3"),
+        (b'{"format": 1, "lengths": ["3"], "episodes": [{}]}', "not counts"),
+        (b'{"format": 1, "lengths": [3], "episodes": [{"info": {}}]}', "without .*'context'"),
+    ],
+)
+def test_a_set_with_a_foreign_header_says_what_is_wrong(
+    tmp_path: Path, balanced: list[Trajectory], header: bytes, words: str
+) -> None:
+    path = tmp_path / "set.npz"
+    save_demonstrations(path, balanced[:1])
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    np.savez(path, **{**arrays, "header": np.frombuffer(header, np.uint8)})
+    with pytest.raises(TrajectoryFileError, match=words):
         load_demonstrations(path)
 
 

@@ -75,6 +75,28 @@ def test_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     assert resumed.report["curve"] == whole.report["curve"]
 
 
+def test_workspace_of_another_fine_tuning_is_refused(tmp_path: Path) -> None:
+    finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF, workspace=tmp_path)
+    flipped = [Preference(one.loser, one.winner) for one in CROSS]
+    with pytest.raises(LearningError, match="labels is .* there and .* here"):
+        finetune(tiny_checkpoint(), labelled_trajectories(), flipped, RODIF, workspace=tmp_path)
+    with pytest.raises(LearningError, match="config is .* there"):
+        finetune(
+            tiny_checkpoint(), labelled_trajectories(), CROSS, replace(RODIF, updates=3),
+            workspace=tmp_path,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["rodif.safetensors", "training.json"])
+def test_damaged_partial_state_is_named(tmp_path: Path, name: str) -> None:
+    arguments = (tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF)
+    finetune(*arguments, workspace=tmp_path)
+    file = tmp_path / name
+    file.write_bytes(file.read_bytes()[:40])
+    with pytest.raises(LearningError, match=f"{name} is no readable partial state.*delete it"):
+        finetune(*arguments, workspace=tmp_path)
+
+
 def test_optimizer_stops_when_the_gate_shuts() -> None:
     config = replace(RODIF, conservativeness=0.45, updates=200)
     report = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config).report
@@ -238,6 +260,36 @@ def test_split_of_equal_scores_is_refused() -> None:
 
 def test_standardise_gives_zeros_when_scores_do_not_differ() -> None:
     assert np.array_equal(standardise(np.ones(3)), np.zeros(3))
+
+
+def test_runs_of_one_mode_that_people_call_equal_are_all_kept() -> None:
+    rng = np.random.default_rng(0)
+    policy = tiny_policy()
+    good = [chain_trajectory(policy, 1, seed=i, x=0.4 + rng.normal(0, 0.01)) for i in range(12)]
+    bad = [chain_trajectory(policy, 1, seed=20 + i, x=0.6, success=False) for i in range(6)]
+    features = PathFeatures.of([*good, *bad], AVOID)
+    preferences = [Preference(i % 12, 12 + j) for i, j in enumerate(rng.integers(0, 6, 60))]
+    ties = [Tie(i % 12, int(j)) for i, j in enumerate(rng.integers(0, 12, 20)) if i % 12 != j]
+    fit = PathUtility.fit(features, preferences, ties)
+    assert (fit.utilities[:12] > fit.cut(features.success)).all()
+    # What nobody has seen is liked when it goes the same way, unless people would tell it apart.
+    assert fit.cut(features.success) < fit.utilities[:12].min()
+
+
+def test_two_modes_are_parted_although_a_third_of_the_labels_is_wrong() -> None:
+    rng = np.random.default_rng(1)
+    policy = tiny_policy()
+    places = np.repeat([0.4, 0.6], 12) + rng.normal(0, 0.01, 24)
+    runs = [chain_trajectory(policy, 1, seed=i, x=float(x)) for i, x in enumerate(places)]
+    features = PathFeatures.of(runs, AVOID)
+    preferences = []
+    for i in range(120):
+        winner, loser = int(rng.integers(12)), int(rng.integers(12, 24))
+        wrong = i % 3 == 0
+        preferences.append(Preference(loser, winner) if wrong else Preference(winner, loser))
+    fit = PathUtility.fit(features, preferences)
+    kept = fit.utilities > fit.cut(features.success)
+    assert kept.tolist() == [True] * 12 + [False] * 12
 
 
 def trial(scale: float, success: float, off: float, predicted: float) -> Trial:

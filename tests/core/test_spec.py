@@ -8,7 +8,18 @@ import math
 import pytest
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
-from rodif_core.spec import FinetuneConfig, GuideConfig, RolloutConfig, TaskName, parse_name
+from rodif_core.spec import (
+    EVALUATION_SEED,
+    LARGEST_SEED,
+    SEEDS_PER_ROUND,
+    SEEDS_PER_USE,
+    SELECTION_SEED,
+    FinetuneConfig,
+    GuideConfig,
+    RolloutConfig,
+    TaskName,
+    parse_name,
+)
 
 
 @pytest.mark.parametrize(
@@ -27,6 +38,33 @@ def test_config_survives_json(config: FinetuneConfig | RolloutConfig) -> None:
 def test_gamma_outside_its_range_names_value_and_range(gamma: float) -> None:
     with pytest.raises(ValueOutOfRangeError, match=r"conservativeness is .*in \[0, 1\)"):
         FinetuneConfig(conservativeness=gamma)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"updates": 1.5}, "updates is 1.5.*a whole number"),
+        ({"updates": "12"}, "updates is '12'.*a whole number"),
+        ({"seed": True}, "seed is True.*a whole number"),
+        ({"conservativeness": "0.3"}, "conservativeness is '0.3'.*a finite number or null"),
+        ({"kl_coef": None}, "kl_coef is None.*a finite number"),
+        ({"executed_only": 1}, "executed_only is 1.*true or false"),
+        ({"guide": 5}, "guide is 5.*an object"),
+        ({"guide": None}, "guide is None.*an object"),
+        ({"guide": {"scales": 3}}, "scales is 3.*a list of finite numbers"),
+        ({"guide": {"scales": [1, "2"]}}, "scales is .*a list of finite numbers"),
+    ],
+)
+def test_value_of_another_type_is_named_with_the_legal_one(data: dict, words: str) -> None:
+    with pytest.raises(ValueOutOfRangeError, match=words):
+        FinetuneConfig.from_json(data)
+
+
+def test_seeds_of_a_fine_tunings_rollouts_stay_below_those_of_evaluations() -> None:
+    uses = 1 + 5  # the choice among scales, and the most self-training passes that are legal
+    last = SELECTION_SEED + SEEDS_PER_ROUND * LARGEST_SEED + SEEDS_PER_USE * uses
+    assert last < EVALUATION_SEED
+    assert uses * SEEDS_PER_USE <= SEEDS_PER_ROUND
 
 
 def test_unknown_method_lists_the_legal_ones() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -74,6 +75,13 @@ def demonstrations_of(task: Task) -> list[Trajectory]:
         seed=2,
         preferred_share=liked / len(task.modes),
     )
+
+
+def test_group_of_a_mode_that_does_not_exist_names_the_legal_ones(task: Task) -> None:
+    assert {task.group_of(mode) for mode in task.modes} == set(task.groups)
+    for foreign in ("X-11", "L-99", ""):
+        with pytest.raises(UnknownNameError, match=re.escape(repr(task.modes[0]))):
+            task.group_of(foreign)
 
 
 def contexts_of(task: Task, seeds: Sequence[int]) -> list[dict[str, Any]]:

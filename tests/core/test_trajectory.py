@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rodif_core.errors import TrajectoryFileError
+from rodif_core.npz import write_archive
 from rodif_core.trajectory import Trajectory
 from tests.core.learning import chain_trajectory, tiny_policy
 
@@ -46,8 +48,27 @@ def test_damaged_file_gives_a_clear_error(damage: str) -> None:
         "flipped": data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :],
         "foreign": b"RIFF" + data[4:],
     }[damage]
-    with pytest.raises(TrajectoryFileError, match="not a readable episode file"):
+    with pytest.raises(TrajectoryFileError, match="the episode file is not readable"):
         Trajectory.from_bytes(damaged)
+
+
+def test_foreign_archive_is_refused_with_what_is_wrong() -> None:
+    array = io.BytesIO()
+    np.save(array, np.zeros(3))
+    good = {"context": {}, "outcome": {}, "info": {}}
+    arrays = {name: getattr(episode(), name) for name in (
+        "observations", "actions", "qpos", "paths", "histories", "chains", "decision_steps",
+    )}  # fmt: skip
+    flat = arrays | {"chains": np.zeros(3, np.float32)}
+    for data, words in (
+        (array.getvalue(), "is not readable"),
+        (write_archive({"format": 1, **good, "outcome": 3}, arrays), "outcome in its header is 3"),
+        (write_archive({"format": 1}, arrays), "context in its header is None"),
+        (write_archive({"format": 9, **good}, arrays), "format 9; this version reads 1"),
+        (write_archive({"format": 1, **good}, flat), r"chains has the shape \(3,\).*4 axes"),
+    ):
+        with pytest.raises(TrajectoryFileError, match=words):
+            Trajectory.from_bytes(data)
 
 
 def test_inconsistent_lengths_are_named() -> None:

@@ -1,8 +1,8 @@
 """Label snapshot → noise estimate → fine-tuning → candidate checkpoint.
 
-The learner keeps partial results in a folder of the round: an attempt that dies is taken up
-where it stood, by the next attempt on the same machine. On another machine it starts again and
-comes to the same weights.
+The learner keeps partial results in a folder of the round: an attempt that dies is taken up by the
+next one on the same machine, after its last saved update or finished trial. On another machine it
+starts again and comes to the same weights.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class Lesson:
     def preferences(self) -> list[Preference]:
         """The comparisons that say which one is better."""
         return [
-            Preference(item.first, item.second, item.annotator)
+            Preference(item.first, item.second)
             if item.choice == Choice.FIRST
-            else Preference(item.second, item.first, item.annotator)
+            else Preference(item.second, item.first)
             for item in self.comparisons
             if item.choice != Choice.EQUAL
         ]

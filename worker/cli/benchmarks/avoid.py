@@ -193,9 +193,9 @@ def _finetuned(
     rng = np.random.default_rng([run.seed, DESIGNS.index(run.design)])
     comparisons = label(run.design, run.corruption, rng)
     preferences = [
-        Preference(item.first, item.second, item.annotator)
+        Preference(item.first, item.second)
         if item.choice == "first"
-        else Preference(item.second, item.first, item.annotator)
+        else Preference(item.second, item.first)
         for item in comparisons
     ]
     gamma = PAPER_CONSERVATIVENESS.get(run.corruption)
