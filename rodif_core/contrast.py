@@ -18,7 +18,7 @@ from rodif_core.spec import FinetuneConfig, FinetuneMethod
 from rodif_core.training_state import load_state, save_state
 
 # stage, fraction of the stage in 0 … 1, metrics to plot; raising from it stops the work
-Progress = Callable[[str, float, dict[str, float]], None]
+StageProgress = Callable[[str, float, dict[str, float]], None]
 SAVE_EVERY = 5  # updates between partial states
 
 
@@ -39,7 +39,7 @@ def contrast(
     *,
     stage: str,
     workspace: Path | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> ContrastResult:
     """Up to `config.updates` exact full-batch updates.
 

@@ -29,7 +29,7 @@ from rodif_core.tasks.base import Task
 from rodif_core.tasks.camera import Camera
 from rodif_core.training_state import (
     Precision,
-    Progress,
+    UpdateProgress,
     cosine_rate,
     forward_precision,
     load_state,
@@ -126,7 +126,7 @@ def train_encoder(
     workspace: Path | None = None,
     device: str = "cpu",
     precision: Precision = Precision.FLOAT32,
-    progress: Progress | None = None,
+    progress: UpdateProgress | None = None,
 ) -> tuple[ImageEncoder, list[dict[str, float]]]:
     """A trained encoder and its curve; goes on from `workspace` when a partial state is there.
 

@@ -10,12 +10,12 @@ from typing import Any
 from rodif_core.drift import off_support_share
 from rodif_core.intervals import wilson_interval
 from rodif_core.policies.checkpoint import Checkpoint
-from rodif_core.rollout import Progress, rollout
+from rodif_core.rollout import EpisodeProgress, rollout
 from rodif_core.spec import RolloutConfig
 from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
 
-PATH_POINTS = 32  # points per stored path, enough for a plot
+PLOTTED_POINTS = 32  # points per stored path, enough for a plot
 MAX_PATHS = 120  # paths kept for plots
 
 
@@ -73,7 +73,7 @@ class Evaluation:
 
 
 def evaluate(
-    checkpoint: Checkpoint, config: RolloutConfig, *, progress: Progress | None = None
+    checkpoint: Checkpoint, config: RolloutConfig, *, progress: EpisodeProgress | None = None
 ) -> Evaluation:
     """Roll out and sum up; the same checkpoint and config give the same result."""
     return summarise(checkpoint, rollout(checkpoint, config, progress=progress))
@@ -96,7 +96,7 @@ def summarise(checkpoint: Checkpoint, trajectories: Sequence[Trajectory]) -> Eva
     )
 
 
-def thin_path(trajectory: Trajectory, points: int = PATH_POINTS) -> list[list[float]]:
+def thin_path(trajectory: Trajectory, points: int = PLOTTED_POINTS) -> list[list[float]]:
     """End-effector path thinned to `points` rows of [x, y, z], in metres to 0.1 mm."""
     last = len(trajectory.paths) - 1
     rows = [trajectory.paths[round(i * last / (points - 1))] for i in range(points)]

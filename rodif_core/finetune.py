@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rodif_core.contrast import Progress, contrast
+from rodif_core.contrast import StageProgress, contrast
 from rodif_core.errors import LearningError
 from rodif_core.guided import finetune_guided
 from rodif_core.log_ratio import PairMatrix, Transitions, kl_per_trajectory
@@ -49,7 +49,7 @@ def finetune(
     *,
     ties: Sequence[Tie] = (),
     workspace: Path | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> FinetuneResult:
     """Steer the policy towards the preferred trajectories; the given checkpoint is the reference.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -21,8 +20,8 @@ from rodif_core.diffusion.chain import add_noise
 from rodif_core.errors import LearningError
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.spec import GuideConfig
+from rodif_core.training_state import UpdateProgress, update_average
 
-Progress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
 REPORT_EVERY = 10  # updates between reports
 
 
@@ -38,7 +37,7 @@ def guide(
     scale: float,
     config: GuideConfig,
     seed: int,
-    progress: Progress | None = None,
+    progress: UpdateProgress | None = None,
 ) -> DiffusionPolicy:
     """Move a copy of the reference towards the kept decisions and return its running average.
 
@@ -69,10 +68,7 @@ def guide(
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-        with torch.no_grad():
-            pairs = zip(average.parameters(), policy.denoiser.parameters(), strict=True)
-            for mean, current in pairs:
-                mean.lerp_(current, 1 - config.ema_decay)
+        update_average(average, policy.denoiser, config.ema_decay)
         if progress is not None and (update % REPORT_EVERY == 0 or update == config.updates - 1):
             progress(update + 1, config.updates, {"loss": value})
     return replace(policy, denoiser=average)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from rodif_core.choice import Trial, choose, improves
-from rodif_core.contrast import Progress
+from rodif_core.contrast import StageProgress
 from rodif_core.drift import off_support_share
 from rodif_core.guidance import guide
 from rodif_core.log_ratio import PairMatrix, Transitions, stack_decisions
@@ -48,17 +48,17 @@ class _Run:
     scores: Scores
     config: FinetuneConfig
     workspace: Path | None
-    progress: Progress | None
+    progress: StageProgress | None
 
     def stage(self, name: str) -> Any:
-        """Progress of one guidance, as `guide` calls it."""
+        """StageProgress of one guidance, as `guide` calls it."""
         progress = self.progress
         if progress is None:
             return None
         return lambda done, of, metrics: progress(name, done / of, metrics)
 
     def tell(self, stage: str, fraction: float, trial: Trial) -> None:
-        """Progress in what a trial showed."""
+        """StageProgress in what a trial showed."""
         if self.progress is not None:
             facts = trial.to_json()
             self.progress(stage, fraction, {name: facts[name] for name in facts if name != "scale"})
@@ -73,7 +73,7 @@ def finetune_guided(
     *,
     ties: Sequence[Tie] = (),
     workspace: Path | None,
-    progress: Progress | None,
+    progress: StageProgress | None,
 ) -> tuple[DiffusionPolicy, dict[str, Any]]:
     """Score, guide at every scale, choose; optional self-training. Returns policy and report.
 

@@ -32,13 +32,14 @@ from rodif_core.spec import TaskName
 from rodif_core.tasks import get_task
 from rodif_core.training_state import (
     Precision,
-    Progress,
+    UpdateProgress,
     check_device,
     claim_workspace,
     cosine_rate,
     forward_precision,
     load_state,
     save_state,
+    update_average,
     usual_precision,
 )
 from rodif_core.trajectory import Trajectory
@@ -83,7 +84,7 @@ def pretrain(
     kept_rows: Path | None = None,
     device: str = "cpu",
     precision: Precision | None = None,
-    progress: Progress | None = None,
+    progress: UpdateProgress | None = None,
 ) -> Checkpoint:
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
 
@@ -194,7 +195,7 @@ def _train(
     workspace: Path | None,
     device: str,
     precision: Precision,
-    progress: Progress | None,
+    progress: UpdateProgress | None,
 ) -> tuple[Any, list[dict[str, float]]]:
     model = policy.denoiser.to(device)
     average = copy.deepcopy(model)
@@ -217,7 +218,7 @@ def _train(
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-        _update_average(average, model, min(config.ema_decay, (1 + update) / (10 + update)))
+        update_average(average, model, min(config.ema_decay, (1 + update) / (10 + update)))
         if update % REPORT_EVERY == 0 or update == config.updates - 1:
             metrics = {
                 "loss": float(loss.detach()),
@@ -254,9 +255,3 @@ def _held_out_loss(policy: DiffusionPolicy, model: nn.Module, rows: Windows) -> 
     pick = torch.randint(len(rows.chunks), (512,), generator=generator)
     histories, chunks = rows.histories[pick].to(device), rows.chunks[pick].to(device)
     return float(_noise_loss(policy, model, histories, chunks, generator))
-
-
-@torch.no_grad()
-def _update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
-    for target, source in zip(average.parameters(), model.parameters(), strict=True):
-        target.lerp_(source, 1 - decay)

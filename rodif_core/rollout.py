@@ -25,7 +25,7 @@ from rodif_core.tasks.base import Task
 from rodif_core.tasks.env import BatchEnv
 from rodif_core.trajectory import Trajectory
 
-Progress = Callable[[int, int], None]  # episodes done, episodes in all
+EpisodeProgress = Callable[[int, int], None]  # episodes done, episodes in all
 
 
 def rollout(
@@ -33,7 +33,7 @@ def rollout(
     config: RolloutConfig,
     *,
     noise_scale: float = 1.0,
-    progress: Progress | None = None,
+    progress: EpisodeProgress | None = None,
 ) -> list[Trajectory]:
     """Run `config.episodes` episodes; episode i draws start and policy noise from seed + i.
 

@@ -1,4 +1,4 @@
-"""What training loops share: rate, precision, and partial state on disk for a killed run to go on.
+"""What training loops share: rate, precision, average, and partial state for a killed run.
 
 One safetensors file (parameters, averages, Adam moments) with a JSON header; written to a
 temporary file, flushed and renamed, so a kill or a power cut in the middle leaves the older state.
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from rodif_core.errors import LearningError, UnknownNameError
 
-Progress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
+UpdateProgress = Callable[[int, int, dict[str, float]], None]  # update, of, metrics
 
 
 class Precision(StrEnum):
@@ -57,6 +57,13 @@ def cosine_rate(update: int, warm_up: int, updates: int) -> float:
         return (update + 1) / warm_up
     fraction = (update - warm_up) / max(1, updates - warm_up)
     return 0.5 * (1 + math.cos(math.pi * fraction))
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
+    """Move the running average of a model's weights towards the model: decay · old + rest · new."""
+    for target, source in zip(average.parameters(), model.parameters(), strict=True):
+        target.lerp_(source, 1 - decay)
 
 
 def claim_workspace(workspace: Path, training: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rodif_core.contrast import Progress, contrast
+from rodif_core.contrast import StageProgress, contrast
 from rodif_core.errors import LearningError
 from rodif_core.log_ratio import (
     PairMatrix,
@@ -71,7 +71,7 @@ def score(
     *,
     ties: Sequence[Tie] = (),
     workspace: Path | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> Scores:
     """Utilities from both models; winners lie above the cut of the configured one."""
     scorer = replace(config, method=FinetuneMethod.RODIF, updates=config.guide.score_updates)

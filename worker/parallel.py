@@ -15,7 +15,7 @@ from worker.leash import end_with_parent
 
 if TYPE_CHECKING:
     from rodif_core.policies.checkpoint import Checkpoint
-    from rodif_core.rollout import Progress
+    from rodif_core.rollout import EpisodeProgress
     from rodif_core.trajectory import Trajectory
 
 
@@ -24,7 +24,7 @@ def parallel_rollout(
     config: RolloutConfig,
     processes: int,
     *,
-    progress: Progress | None = None,
+    progress: EpisodeProgress | None = None,
 ) -> list[Trajectory]:
     """As `rodif_core.rollout.rollout`, the episodes shared out among fresh processes.
 
@@ -61,7 +61,7 @@ def _spread(
     checkpoint: Checkpoint,
     config: RolloutConfig,
     *,
-    progress: Progress | None = None,
+    progress: EpisodeProgress | None = None,
 ) -> list[Trajectory]:
     """The episodes in their order, made by the pool in at least `shares` batches of equal size."""
     from rodif_core.policies.checkpoint import save_checkpoint

@@ -57,7 +57,7 @@ MIN_X, MIN_REACH = 0.22, 0.30  # m
 X = (0.4, 0.6)  # m; starts and targets
 BOX_Y, TARGET_Y = (-0.25, -0.10), (0.20, 0.35)  # m
 
-NEAR = 0.018  # m between box and target: reached, as D3IL
+REACHED_WITHIN = 0.018  # m between box and target: reached, as D3IL
 TURNED = 0.048 * np.pi  # rad (8.6 degrees) between box and target: reached, as D3IL
 FALLEN = -0.02  # m; a box that is lower has left the table
 UPRIGHT = 0.7  # cosine of the tilt; a box that is tilted farther has toppled
@@ -205,13 +205,13 @@ def within_reach(points: Array) -> Array:
 
 
 def aligned(objects: Array) -> NDArray[np.bool_]:
-    """(m,) bool: the box of poses (m, 2, 7) is within NEAR and TURNED of the target.
+    """(m,) bool: the box of poses (m, 2, 7) is within REACHED_WITHIN and TURNED of the target.
 
     Distance in three dimensions; the angle is that of the whole rotation, so a tilt counts too.
     """
     box, target = objects[:, 0], objects[:, 1]
     offset = box[:, :3] - target[:, :3]
-    near = np.sqrt((offset * offset).sum(axis=1)) <= NEAR
+    near = np.sqrt((offset * offset).sum(axis=1)) <= REACHED_WITHIN
     same = np.abs((box[:, 3:] * target[:, 3:]).sum(axis=1))  # q and -q are the same rotation
     return np.asarray(near & (2 * np.arccos(np.minimum(same, 1.0)) <= TURNED))
 

@@ -38,7 +38,7 @@ MAX_YAW = np.pi / 2  # rad; cubes start turned by up to this, either way
 
 APART = 0.09  # m between the centres of two cubes at the start: their diagonals are 8.5 cm
 
-NEAR = 0.06  # m; scale on which `push_frame` tells places beside a cube apart
+OFFSET_SCALE = 0.06  # m; scale on which `push_frame` tells places beside a cube apart
 
 
 def pusher_scene(mesh: Mesh) -> mujoco.MjSpec:
@@ -164,14 +164,14 @@ def push_frame(ends: Array, cubes: Array, targets: Array) -> Array:
     """Where the rod is as a push from cube to target sees it: (m, 2) in (-1, 1).
 
     ends, cubes, targets (m, 2). Along the push (negative behind the cube) and across it (positive
-    on the left), each as tanh(metres / NEAR): fine beside the cube, coarse elsewhere.
+    on the left), each as tanh(metres / OFFSET_SCALE): fine beside the cube, coarse elsewhere.
     """
     way = targets - cubes
     way = way / np.maximum(np.sqrt((way * way).sum(axis=1, keepdims=True)), 1e-6)
     offset = ends - cubes
     along = (offset * way).sum(axis=1)
     across = way[:, 0] * offset[:, 1] - way[:, 1] * offset[:, 0]
-    return np.asarray(np.tanh(np.stack([along, across], axis=1) / NEAR))
+    return np.asarray(np.tanh(np.stack([along, across], axis=1) / OFFSET_SCALE))
 
 
 def target_shape(

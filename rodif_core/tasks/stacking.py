@@ -79,7 +79,7 @@ FALLEN = 0.0  # m; a block whose centre is lower has left the table
 JOINT_LIMIT = 0.06  # rad per control step
 GRIPPER_LIMIT = 0.008  # m per control step: open to closed in ten
 
-NEAR = 0.06  # m; scale on which tanh features tell places near a goal apart
+OFFSET_SCALE = 0.06  # m; scale on which tanh features tell places near a goal apart
 
 
 class StackingStateTask(Task):
@@ -160,7 +160,8 @@ class StackingStateTask(Task):
         """Proprioception (14), then of every block: x, y, z, sin and cos of its yaw times its
         symmetry (15); its offset from the jaws and sin and cos of the turn that a grasp still
         lacks (15); its offset from the next place of the tower (9). Then the offset of that place
-        from the jaws (3), and which blocks are in the tower (3). Offsets are tanh(metres / NEAR).
+        from the jaws (3), and which blocks are in the tower (3). Offsets are
+        tanh(metres / OFFSET_SCALE).
         """
         levels = placed_levels(view.objects, view.ends)
         place = next_place(view.objects, levels)
@@ -251,7 +252,7 @@ def sin_cos(angles: Array) -> Array:
 
 def near(offsets: Array) -> Array:
     """Offsets in metres to (-1, 1): fine near 0, coarse elsewhere."""
-    return np.asarray(np.tanh(offsets / NEAR))
+    return np.asarray(np.tanh(offsets / OFFSET_SCALE))
 
 
 def placed_levels(objects: Array, ends: Array) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ from rodif_core.tasks.aligning import (
     INNER,
     LOW,
     MIN_REACH,
-    NEAR,
+    REACHED_WITHIN,
     TOP,
     TURNED,
     AligningStateTask,
@@ -146,8 +146,8 @@ def test_pushing_a_wall_moves_the_box_and_ends_nothing(mode: str) -> None:
     ("offset", "turn", "reached"),
     [
         ((0.0, 0.0, 0.0), 0.0, True),
-        ((NEAR - 1e-4, 0.0, 0.0), 0.0, True),
-        ((NEAR + 1e-4, 0.0, 0.0), 0.0, False),
+        ((REACHED_WITHIN - 1e-4, 0.0, 0.0), 0.0, True),
+        ((REACHED_WITHIN + 1e-4, 0.0, 0.0), 0.0, False),
         ((0.013, 0.013, 0.0), 0.0, False),  # 18.4 mm
         ((0.012, 0.0, 0.014), 0.0, False),  # height counts
         ((0.0, 0.0, 0.0), math.radians(8.5), True),
@@ -173,7 +173,7 @@ def test_a_tilted_box_is_not_aligned() -> None:
 
 
 def test_thresholds_are_those_of_d3il() -> None:
-    assert NEAR == 0.018
+    assert REACHED_WITHIN == 0.018
     assert TURNED / math.pi == pytest.approx(0.048)
 
 
