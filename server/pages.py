@@ -24,6 +24,7 @@ from server.api import errors
 from server.api.access import COOKIE, Anyone, UseServices, who
 from server.api.services import services_of
 from server.errors import ArtifactError, NotFoundError, NotSignedInError
+from server.replay_client import check_parameters, replay_client
 from server.sign_in import Me
 from server.states import Role
 from server.store.tables import Campaign, Pair
@@ -31,14 +32,6 @@ from server.store.tables import Campaign, Pair
 PAGE_POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
     " object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
-)
-# The viewer is one file with inline scripts and WebAssembly. A recording can carry scripts that
-# the viewer would run with `new Function`: without 'unsafe-eval' the browser refuses them.
-REPLAY_CLIENT_POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:;"
-    " worker-src blob: data:; connect-src 'self' data: blob:; img-src 'self' data: blob:;"
-    " style-src 'self' 'unsafe-inline'; font-src 'self' data:; object-src 'none';"
-    " base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
 FOR_EVER = "private, max-age=31536000, immutable"  # content-addressed files never change
 
@@ -211,29 +204,22 @@ def thumbnail(sha256: str, _me: Anyone, services: UseServices) -> FileResponse:
 
 
 @router.get("/replay-client/")
-def replay_client(request: Request) -> Response:
+def show_replay(request: Request) -> Response:
     """The viewer out of the installed viser package, with our adapter in its head."""
     if _visitor(request) is None:
         raise NotSignedInError("sign in first")
-    page = _replay_client_page()
-    tag = f'"{hashlib.sha256(page).hexdigest()[:32]}"'
+    check_parameters(request.query_params)
+    adapter = (_site() / "static" / "replay-adapter.js").read_bytes()
+    client = replay_client(package_folder("viser") / "client" / "build" / "index.html", adapter)
+    tag = f'"{hashlib.sha256(client.page).hexdigest()[:32]}"'
     headers = {
-        "Content-Security-Policy": REPLAY_CLIENT_POLICY,
+        "Content-Security-Policy": client.policy,
         "Cache-Control": "private, no-cache",
         "ETag": tag,
     }
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    return Response(page, media_type="text/html", headers=headers)
-
-
-def _replay_client_page() -> bytes:
-    page = (package_folder("viser") / "client" / "build" / "index.html").read_bytes()
-    head, found, rest = page.partition(b"</head>")
-    if not found:
-        raise NotFoundError("</head> in the page of the installed viser", "index.html")
-    adapter = (_site() / "static" / "replay-adapter.js").read_bytes()
-    return head + b"<script>" + adapter + b"</script>" + found + rest
+    return Response(client.page, media_type="text/html", headers=headers)
 
 
 @router.get("/vendor/plotly.min.js")

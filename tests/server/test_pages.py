@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import re
 
 import pytest
 
-from server.pages import REPLAY_CLIENT_POLICY
 from server.store.tables import Pair
 from tests.server.world import World
 
@@ -142,19 +142,67 @@ def test_a_replay_that_is_no_hash_is_not_found(sqlite_world: World, name: str) -
     assert sqlite_world.signed_in("ann").get(f"/replays/{name}.viser").status_code == 404
 
 
+REPLAY = f"/replays/{'0' * 64}.viser"
+
+
 def test_the_replay_client_is_the_installed_one_with_our_adapter(sqlite_world: World) -> None:
-    assert sqlite_world.browser().get("/replay-client/").status_code == 401
+    address = f"/replay-client/?playbackPath={REPLAY}&logCamera=1&start=paused"
+    assert sqlite_world.browser().get(address).status_code == 401
     browser = sqlite_world.signed_in("ann")
-    answer = browser.get("/replay-client/")
+    answer = browser.get(address)
     assert answer.status_code == 200
-    assert answer.headers["content-security-policy"] == REPLAY_CLIENT_POLICY
-    assert "'unsafe-eval'" not in REPLAY_CLIENT_POLICY
     adapter = browser.get("/static/replay-adapter.js").text
     head, found, _rest = answer.text.partition(f"<script>{adapter}</script></head>")
     assert found and "<body" not in head
     assert len(answer.content) > 500_000
-    again = browser.get("/replay-client/", headers={"If-None-Match": answer.headers["etag"]})
+    again = browser.get(address, headers={"If-None-Match": answer.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
+
+
+def test_the_replay_clients_policy_names_the_scripts_of_the_page_and_no_others(
+    sqlite_world: World,
+) -> None:
+    answer = sqlite_world.signed_in("ann").get(f"/replay-client/?playbackPath={REPLAY}")
+    policy = answer.headers["content-security-policy"]
+    (sources,) = re.findall(r"script-src ([^;]+);", policy)
+    assert policy.startswith("default-src 'none';")
+    named = set(sources.split()) - {"'wasm-unsafe-eval'"}
+    assert all(re.fullmatch(r"'sha256-[0-9A-Za-z+/]{43}='", source) for source in named)
+    scripts = re.findall(r"<script[^>]*>(.+?)</script>", answer.text, flags=re.DOTALL)
+    digests = [hashlib.sha256(script.encode()).digest() for script in scripts]
+    on_page = {f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests}
+    assert len(on_page) == 2 and on_page < named
+    assert len(named) == 3  # the third is what the client unpacks, as a browser test shows
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "",
+        "?playbackPath=",
+        "?playbackPath=data:application/octet-stream;base64,AAAA",
+        "?playbackPath=https://example.org/a.viser",
+        f"?playbackPath=//example.org{REPLAY}",
+        f"?playbackPath=/label/..{REPLAY}",
+        f"?playbackPath={REPLAY}%0A",
+        f"?playbackPath={REPLAY.upper()}",
+        f"?playbackPath={REPLAY}&playbackPath={REPLAY}",
+        f"?playbackPath={REPLAY}&%70laybackPath=data:,",
+        f"?playbackPath={REPLAY}&websocket=ws://example.org",
+        f"?playbackPath={REPLAY}&websocket",
+    ],
+)
+def test_the_replay_client_shows_nothing_but_one_recording_of_this_site(
+    sqlite_world: World, query: str
+) -> None:
+    answer = sqlite_world.signed_in("ann").get(f"/replay-client/{query}")
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    (error,) = answer.json()["errors"]
+    assert (error["field"], error["legal"]) in (
+        ("playbackPath", "one /replays/<sha256>.viser"),
+        ("websocket", "absent"),
+    )
 
 
 def test_plotly_comes_out_of_the_installed_package(sqlite_world: World) -> None:
