@@ -178,6 +178,10 @@ def test_an_unknown_token_is_refused(sqlite_world: World, token: str) -> None:
         ({"Origin": "http://testserver.evil.example"}, False),
         ({"Origin": "null"}, False),
         ({}, False),
+        ({"Authorization": "Basic YWRhOnNlY3JldA==", "Sec-Fetch-Site": "cross-site"}, False),
+        ({"Authorization": "Basic YWRhOnNlY3JldA==", "Sec-Fetch-Site": "same-origin"}, True),
+        ({"Authorization": "Bearer", "Sec-Fetch-Site": "cross-site"}, False),
+        ({"Authorization": "Bearer ", "Origin": "http://evil.example"}, False),
     ],
 )
 def test_a_cookie_counts_only_on_requests_from_our_own_pages(
