@@ -7,9 +7,10 @@ import hashlib
 import pytest
 from sqlalchemy import select
 
+from server.passwords import hash_password
 from server.sign_in import MAX_FAILURES_PER_ADDRESS, MAX_FAILURES_PER_NAME
 from server.store.tables import AuditEntry, BrowserSession
-from tests.factories import PASSWORD
+from tests.factories import PASSWORD, add_account
 from tests.server.world import World
 
 SIGN_IN = "/api/v1/session"
@@ -101,17 +102,47 @@ def test_a_deactivated_account_is_out_at_once_everywhere(world: World) -> None:
     assert browser.get("/api/v1/me").status_code == 401
     assert script.get("/me").status_code == 401
     assert world.browser().post(SIGN_IN, json=RIGHT).status_code == 401
+    path = f"/annotators/{world.ids['ann']}"
+    assert world.client("ada").patch(path, json={"active": True}).status_code == 200
+    assert browser.get("/api/v1/me").status_code == 401
+    assert "this token was revoked" in script.get("/me").json()["detail"]
+    assert world.browser().post(SIGN_IN, json=RIGHT).status_code == 200
 
 
-def test_a_new_password_signs_browsers_out(sqlite_world: World) -> None:
-    browser = sqlite_world.signed_in("ann")
-    admin = sqlite_world.client("ada")
-    path = f"/annotators/{sqlite_world.ids['ann']}"
+def test_a_new_password_ends_sessions_and_tokens_of_this_account_only(world: World) -> None:
+    browser, script = world.signed_in("ann"), world.client("ann")
+    admin = world.client("ada")
+    path = f"/annotators/{world.ids['ann']}"
+    assert admin.patch(path, json={"role": "annotator"}).status_code == 200
+    assert script.get("/me").status_code == 200
     assert admin.patch(path, json={"password": "quite another one"}).status_code == 200
     assert browser.get("/api/v1/me").status_code == 401
-    assert sqlite_world.browser().post(SIGN_IN, json=RIGHT).status_code == 401
+    assert "this token was revoked" in script.get("/me").json()["detail"]
+    assert world.client("bob").get("/me").status_code == 200
+    assert world.browser().post(SIGN_IN, json=RIGHT).status_code == 401
     body = {"name": "ann", "password": "quite another one"}
-    assert sqlite_world.browser().post(SIGN_IN, json=body).status_code == 200
+    assert world.browser().post(SIGN_IN, json=body).status_code == 200
+
+
+def test_others_can_write_while_a_password_is_hashed(
+    sqlite_world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed = []
+
+    def hash_while_others_write(password: str, *, cheap: bool) -> str:
+        with sqlite_world.database.write() as session:  # SQLite has one writer at a time
+            add_account(session, f"other {len(hashed)}")
+        hashed.append(password)
+        return hash_password(password, cheap=cheap)
+
+    monkeypatch.setattr("server.api.accounts.hash_password", hash_while_others_write)
+    admin = sqlite_world.client("ada")
+    body = {"name": "new", "role": "annotator", "password": "secret-secret"}
+    made = admin.post("/annotators", json=body)
+    assert made.status_code == 201
+    changed = admin.patch(f"/annotators/{made.json()['id']}", json={"password": "other-secret"})
+    assert changed.status_code == 200
+    assert hashed == ["secret-secret", "other-secret"]
 
 
 def test_the_last_admin_cannot_be_locked_out(world: World) -> None:
@@ -150,12 +181,19 @@ def test_a_revoked_token_is_refused(sqlite_world: World) -> None:
 
 def test_annotators_handle_their_own_tokens_only(sqlite_world: World) -> None:
     ann = sqlite_world.client("ann")
-    assert ann.post("/tokens", json={"name": "mine"}).status_code == 201
+    assert ann.post("/tokens", json={"name": "mine", "days": 90}).status_code == 201
+    for_years = ann.post("/tokens", json={"name": "mine", "days": 3650})
+    assert for_years.status_code == 422
+    assert "days is 3650.0, but must be at most 90" in for_years.json()["detail"]
+    body = {"name": "theirs", "days": 3650, "annotator_id": sqlite_world.ids["ann"]}
+    issued = sqlite_world.client("ada").post("/tokens", json=body)
+    assert issued.status_code == 201
+    assert ann.delete(f"/tokens/{issued.json()['id']}").status_code == 204
     other = {"annotator_id": sqlite_world.ids["bob"], "name": "not mine"}
     assert ann.post("/tokens", json=other).status_code == 403
     bobs = sqlite_world.client("bob").get("/tokens?mine=true").json()[0]["id"]
     assert ann.delete(f"/tokens/{bobs}").status_code == 403
-    assert len(sqlite_world.client("ada").get("/tokens").json()) == 5
+    assert len(sqlite_world.client("ada").get("/tokens").json()) == 6
     assert len(sqlite_world.client("ada").get("/tokens?mine=true").json()) == 1
 
 
