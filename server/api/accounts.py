@@ -40,16 +40,16 @@ def open_session(
 ) -> SessionOut:
     """Sign in; the answer sets the session cookie."""
     now, settings = services.clock(), services.settings
-    address = request.client.host if request.client else "unknown"
+    source = sign_in.source_of(request.client.host if request.client else None)
     # Three short transactions: the failure must be stored although the answer is an error, and
     # no writer may wait for the slow hash.
     with services.database.write() as session:
-        sign_in.note_attempt(session, now, name=body.name, address=address)
+        sign_in.note_attempt(session, now, name=body.name, source=source)
     with services.database.read() as session:
         me = sign_in.check_password(session, body.name, body.password, cheap=settings.argon2_cheap)
     lifetime = timedelta(hours=settings.session_hours)
     with services.database.write() as session:
-        secret = sign_in.open_session(session, now, me, lifetime=lifetime)
+        secret = sign_in.open_session(session, now, me, source=source, lifetime=lifetime)
     response.set_cookie(
         COOKIE,
         secret,

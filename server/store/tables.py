@@ -112,7 +112,7 @@ class ApiToken(Base):
 
 
 class SignInAttempt(Base):
-    """One failed sign-in, for throttling by account name and by address."""
+    """One failed sign-in, for throttling by name and address (`sign_in.source_of`)."""
 
     __tablename__ = "sign_in_attempt"
     id: Mapped[int] = mapped_column(primary_key=True)

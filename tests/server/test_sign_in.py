@@ -6,9 +6,14 @@ import hashlib
 
 import pytest
 from sqlalchemy import select
+from starlette.testclient import TestClient
 
 from server.passwords import hash_password
-from server.sign_in import MAX_FAILURES_PER_ADDRESS, MAX_FAILURES_PER_NAME
+from server.sign_in import (
+    MAX_FAILURES_PER_ADDRESS,
+    MAX_FAILURES_PER_NAME_AND_ADDRESS,
+    source_of,
+)
 from server.store.tables import AuditEntry, BrowserSession
 from tests.factories import PASSWORD, add_account
 from tests.server.world import World
@@ -72,9 +77,14 @@ def test_wrong_credentials_say_the_same(sqlite_world: World, body: dict[str, str
     assert "set-cookie" not in answer.headers
 
 
-def test_guessing_a_password_is_throttled_by_name_and_then_forgiven(world: World) -> None:
+def _at(browser: TestClient, address: str) -> TestClient:
+    """The same application, asked from another address."""
+    return TestClient(browser.app, headers=browser.headers, client=(address, 50000))
+
+
+def test_guessing_a_password_is_throttled_and_then_forgiven(world: World) -> None:
     browser = world.browser()
-    for _ in range(MAX_FAILURES_PER_NAME):
+    for _ in range(MAX_FAILURES_PER_NAME_AND_ADDRESS):
         assert browser.post(SIGN_IN, json=WRONG).status_code == 401
     answer = browser.post(SIGN_IN, json=RIGHT)  # even the right one now
     assert answer.status_code == 429
@@ -86,12 +96,37 @@ def test_guessing_a_password_is_throttled_by_name_and_then_forgiven(world: World
     assert browser.post(SIGN_IN, json=WRONG).status_code == 401  # counting starts anew
 
 
+def test_nobody_is_locked_out_by_guesses_from_elsewhere(sqlite_world: World) -> None:
+    guesser = _at(sqlite_world.browser(), "203.0.113.7")
+    for _ in range(MAX_FAILURES_PER_NAME_AND_ADDRESS):
+        assert guesser.post(SIGN_IN, json=WRONG).status_code == 401
+    owner = _at(sqlite_world.browser(), "192.0.2.1")
+    assert owner.post(SIGN_IN, json=RIGHT).status_code == 200
+    assert guesser.post(SIGN_IN, json=RIGHT).status_code == 429
+
+
 def test_guessing_many_names_is_throttled_by_address(sqlite_world: World) -> None:
     browser = sqlite_world.browser()
     for index in range(MAX_FAILURES_PER_ADDRESS):
         body = {"name": f"guess{index}", "password": PASSWORD}
         assert browser.post(SIGN_IN, json=body).status_code == 401
     assert browser.post(SIGN_IN, json=RIGHT).status_code == 429
+    assert _at(browser, "192.0.2.1").post(SIGN_IN, json=RIGHT).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("host", "source"),
+    [
+        ("192.0.2.1", "192.0.2.1"),
+        ("::ffff:192.0.2.1", "192.0.2.1"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("testclient", "testclient"),
+        (None, "unknown"),
+    ],
+)
+def test_attempts_are_counted_by_what_one_host_has(host: str | None, source: str) -> None:
+    assert source_of(host) == source
 
 
 def test_a_deactivated_account_is_out_at_once_everywhere(world: World) -> None:
