@@ -34,6 +34,27 @@ def test_everybody_has_a_home(sqlite_world: World, name: str, home: str) -> None
         assert (answer.status_code, answer.headers["location"]) == (303, home)
 
 
+@pytest.mark.parametrize(
+    ("asked", "goal"),
+    [
+        ("/label/1", "/label/1"),
+        ("/label/1%3Fview%3Dtop%26x%3Da%2520b", "/label/1?view=top&x=a%20b"),
+        ("//evil.example", "/admin"),
+        ("/%5Cevil.example", "/admin"),
+        ("/%09/evil.example", "/%09/evil.example"),  # a path of this site that does not exist
+        ("https://evil.example/label", "/admin"),
+        ("label", "/admin"),
+        ("", "/admin"),
+    ],
+)
+def test_who_is_signed_in_goes_on_to_what_was_asked_for_on_this_site(
+    sqlite_world: World, asked: str, goal: str
+) -> None:
+    browser = sqlite_world.signed_in("ada")
+    answer = browser.get(f"/sign-in?next={asked}", follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, goal)
+
+
 @pytest.mark.parametrize("path", ["/sign-in", *PAGES])
 def test_pages_render_under_a_policy_that_allows_no_foreign_or_inline_script(
     sqlite_world: World, path: str
@@ -73,6 +94,14 @@ def test_a_page_of_an_unknown_campaign_says_so(sqlite_world: World) -> None:
     assert answer.status_code == 404 and "no campaign 99" in answer.text
     assert 'class="brand"' in answer.text
     assert sqlite_world.signed_in("ann").get("/label/abc").status_code == 404
+
+
+@pytest.mark.parametrize("number", ["0", str(2**31), "9" * 20, "9" * 5000, "-1", "1.5", "%00", "²"])
+def test_what_no_database_takes_for_a_number_is_no_campaign(world: World, number: str) -> None:
+    browser = world.signed_in("ada")
+    for path in (f"/label/{number}", f"/admin/campaigns/{number}"):
+        answer = browser.get(path)
+        assert answer.status_code == 404 and "There is no campaign" in answer.text
 
 
 def test_unknown_addresses_answer_people_with_a_page_and_scripts_with_json(
@@ -137,9 +166,16 @@ def test_browsers_ask_for_site_files_each_time(sqlite_world: World) -> None:
     assert (again.status_code, again.headers["cache-control"]) == (304, "no-cache")
 
 
-@pytest.mark.parametrize("name", ["..%2f..%2frodif", "A" * 64, "short"])
-def test_a_replay_that_is_no_hash_is_not_found(sqlite_world: World, name: str) -> None:
-    assert sqlite_world.signed_in("ann").get(f"/replays/{name}.viser").status_code == 404
+@pytest.mark.parametrize("name", ["..%2f..%2frodif", "A" * 64, "short", "%00", "%ed%a0%80"])
+def test_a_replay_that_is_no_hash_is_not_found(world: World, name: str) -> None:
+    browser = world.signed_in("ann")
+    for path in (f"/replays/{name}.viser", f"/thumbnails/{name}.webp"):
+        assert browser.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("name", ["%00", "x" * 5000, "%ed%a0%80"])
+def test_an_odd_name_of_a_site_file_is_not_found(sqlite_world: World, name: str) -> None:
+    assert sqlite_world.browser().get(f"/static/{name}").status_code == 404
 
 
 REPLAY = f"/replays/{'0' * 64}.viser"
