@@ -1,7 +1,8 @@
 """All SQL tables. Rows are the truth; files hold only what SQL points to by SHA-256.
 
 Timestamps are aware and in UTC. JSON columns hold plain JSON types. Labels, simulated truth,
-publications and audit rows are append-only: triggers in the migrations refuse UPDATE and DELETE.
+publications, events and audit rows are append-only: triggers in the migrations refuse UPDATE and
+DELETE.
 """
 
 from __future__ import annotations
