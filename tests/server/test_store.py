@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -201,3 +202,20 @@ def test_an_interrupted_write_leaves_nothing(
     with pytest.raises(OSError, match="disk full"):
         store.put(b"half")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_database_opens_no_more_connections_than_it_may(database_url: str) -> None:
+    limited = Database(database_url, connections=3)
+
+    def ask() -> int | None:
+        with limited.read() as session:
+            return session.scalar(select(1))
+
+    with ThreadPoolExecutor(1) as pool:
+        with limited.read() as one, limited.read() as two, limited.read() as three:
+            assert [session.scalar(select(1)) for session in (one, two, three)] == [1, 1, 1]
+            fourth = pool.submit(ask)
+            with pytest.raises(TimeoutError):
+                fourth.result(timeout=0.5)
+        assert fourth.result(timeout=30) == 1
+    limited.dispose()
