@@ -10,7 +10,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from server.errors import ConflictError, NotAllowedError, NotFoundError
-from server.passwords import digest, hash_password, new_token
+from server.passwords import digest, new_token
 from server.sign_in import Me
 from server.states import AnnotatorKind, Role
 from server.store.events import audit
@@ -25,16 +25,18 @@ def create_annotator(
     name: str,
     role: Role,
     kind: AnnotatorKind,
-    password: str | None,
+    password_hash: str | None,
     by: int | None,
-    cheap: bool = False,
 ) -> Annotator:
-    """Add an account; without a password it can only use tokens. ConflictError: name is taken."""
+    """Add an account; without a password it can only use tokens. ConflictError: name is taken.
+
+    `password_hash` comes from `hash_password`, made before the transaction: it is slow on purpose.
+    """
     account = Annotator(
         name=name,
         role=role,
         kind=kind,
-        password_hash=None if password is None else hash_password(password, cheap=cheap),
+        password_hash=password_hash,
         created_at=now,
     )
     try:
@@ -59,13 +61,13 @@ def change_annotator(
     annotator_id: int,
     *,
     active: bool | None,
-    password: str | None,
+    password_hash: str | None,
     role: Role | None,
     by: int,
-    cheap: bool = False,
 ) -> Annotator:
-    """Change what is not None. A new password or a deactivation signs all browsers out.
+    """Change what is not None. A new password or a deactivation ends all sessions and tokens.
 
+    Whoever gets the account back, or a new password, may not be the one who has its old tokens.
     Raises NotFoundError, or ConflictError when no active admin would be left.
     """
     account = session.get(Annotator, annotator_id)
@@ -78,23 +80,28 @@ def change_annotator(
         account.active = active
     if role is not None:
         account.role = role
-    if password is not None:
-        account.password_hash = hash_password(password, cheap=cheap)
-    if active is False or password is not None:
-        session.execute(
-            update(BrowserSession)
-            .where(BrowserSession.annotator_id == account.id, BrowserSession.revoked_at.is_(None))
-            .values(revoked_at=now)
-        )
+    if password_hash is not None:
+        account.password_hash = password_hash
+    if active is False or password_hash is not None:
+        _sign_out_everywhere(session, now, account.id)
     audit(
         session,
         now,
         actor_id=by,
         action="annotator.change",
         subject=f"annotator/{account.id}",
-        details={"active": active, "role": role, "password": password is not None},
+        details={"active": active, "role": role, "password": password_hash is not None},
     )
     return account
+
+
+def _sign_out_everywhere(session: Session, now: datetime, annotator_id: int) -> None:
+    for table in (BrowserSession, ApiToken):
+        session.execute(
+            update(table)
+            .where(table.annotator_id == annotator_id, table.revoked_at.is_(None))
+            .values(revoked_at=now)
+        )
 
 
 def _refuse_last_admin(session: Session, account: Annotator) -> None:

@@ -48,7 +48,11 @@ def create_app(
     """
     settings = settings or Settings()
     assert settings.artifact_dir is not None
-    database = Database(settings.database_url, send_job or make_sender(settings.broker_url))
+    database = Database(
+        settings.database_url,
+        send_job or make_sender(settings.broker_url),
+        connections=settings.database_connections,
+    )
 
     app = FastAPI(
         title="RoDiF Studio",

@@ -25,7 +25,7 @@ def ensure_admin(
     *,
     cheap: bool = False,
 ) -> str | None:
-    """Make sure that an admin account `name` exists.
+    """Make sure that an admin account `name` exists; a given password also activates it again.
 
     Returns its password when it was set now (the given one, or a new random one), and None when
     the account exists and no password was given. Raises ConflictError for an account of that name
@@ -41,6 +41,7 @@ def ensure_admin(
         account = Annotator(name=name, role=Role.ADMIN, kind=AnnotatorKind.PERSON, created_at=now)
         session.add(account)
     account.password_hash = hash_password(secret, cheap=cheap)
+    account.active = True
     session.flush()
     audit(session, now, actor_id=None, action="admin.ensure", subject=f"annotator/{account.id}")
     return secret

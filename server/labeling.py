@@ -281,9 +281,12 @@ def record_truth(
     )
     known = session.get(SimulatedTruth, label_id)
     if known is None:
-        session.add(truth)
-        session.flush()
-        return truth, True
+        try:
+            with session.begin_nested():
+                session.add(truth)
+            return truth, True
+        except IntegrityError:  # another request has told it at the same time
+            known = session.get_one(SimulatedTruth, label_id)
     same = (known.true_choice, known.corruption, known.criterion) == (
         truth.true_choice,
         truth.corruption,

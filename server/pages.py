@@ -6,6 +6,7 @@ Nothing here imports the packages whose files it serves: `find_spec` tells where
 from __future__ import annotations
 
 import hashlib
+import re
 from http import HTTPStatus
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +25,8 @@ from server.api import errors
 from server.api.access import COOKIE, Anyone, UseServices, who
 from server.api.services import services_of
 from server.errors import ArtifactError, NotFoundError, NotSignedInError
+from server.replay_client import check_parameters, replay_client
+from server.schemas.common import MAX_ID
 from server.sign_in import Me
 from server.states import Role
 from server.store.tables import Campaign, Pair
@@ -32,14 +35,8 @@ PAGE_POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
     " object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
-# The viewer is one file with inline scripts and WebAssembly. A recording can carry scripts that
-# the viewer would run with `new Function`: without 'unsafe-eval' the browser refuses them.
-REPLAY_CLIENT_POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:;"
-    " worker-src blob: data:; connect-src 'self' data: blob:; img-src 'self' data: blob:;"
-    " style-src 'self' 'unsafe-inline'; font-src 'self' data:; object-src 'none';"
-    " base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
-)
+_NUMBER = re.compile("[0-9]{1,10}", flags=re.ASCII)  # as many digits as MAX_ID has
+_SHA256 = re.compile("[0-9a-f]{64}", flags=re.ASCII)
 FOR_EVER = "private, max-age=31536000, immutable"  # content-addressed files never change
 
 router = APIRouter(include_in_schema=False)
@@ -101,6 +98,12 @@ def _to_sign_in(request: Request) -> RedirectResponse:
     return RedirectResponse(f"/sign-in?next={quote(asked, safe='/')}", status_code=303)
 
 
+def _asked_for(request: Request) -> str | None:
+    """Where `next` leads on this site; browsers take `//host` and `/\\host` for another one."""
+    asked = request.query_params.get("next", "")
+    return asked if asked.startswith("/") and asked[1:2] not in ("/", "\\") else None
+
+
 def _render(request: Request, template: str, **context: Any) -> Response:
     templates = request.app.state.templates
     assert isinstance(templates, Jinja2Templates)
@@ -110,7 +113,7 @@ def _render(request: Request, template: str, **context: Any) -> Response:
 
 
 def _page(
-    request: Request, template: str, *, admin: bool = False, campaign_id: int | None = None
+    request: Request, template: str, *, admin: bool = False, campaign_id: str | None = None
 ) -> Response:
     """A page for the signed-in; others go to the sign-in page or, if not admins, to `/label`."""
     me = _visitor(request)
@@ -120,8 +123,10 @@ def _page(
         return RedirectResponse("/label", status_code=303)
     if campaign_id is None:
         return _render(request, template, me=me)
-    with services_of(request).database.read() as session:
-        campaign = session.get(Campaign, campaign_id)
+    campaign = None
+    if _NUMBER.fullmatch(campaign_id) and int(campaign_id) <= MAX_ID:
+        with services_of(request).database.read() as session:
+            campaign = session.get(Campaign, int(campaign_id))
     if campaign is None:
         return _not_found(request, me, f"There is no campaign {campaign_id}.")
     return _render(request, template, me=me, campaign=campaign)
@@ -156,7 +161,7 @@ def sign_in_page(request: Request) -> Response:
     """Name and password."""
     me = _visitor(request)
     if me is not None:
-        return RedirectResponse(_home(me), status_code=303)
+        return RedirectResponse(_asked_for(request) or _home(me), status_code=303)
     return _render(request, "sign_in.html", me=None)
 
 
@@ -166,8 +171,8 @@ def label_index(request: Request) -> Response:
     return _page(request, "label_home.html")
 
 
-@router.get("/label/{campaign_id:int}")
-def label_page(request: Request, campaign_id: int) -> Response:
+@router.get("/label/{campaign_id}")
+def label_page(request: Request, campaign_id: str) -> Response:
     """The annotator's page."""
     return _page(request, "label.html", campaign_id=campaign_id)
 
@@ -178,8 +183,8 @@ def admin_index(request: Request) -> Response:
     return _page(request, "admin_index.html", admin=True)
 
 
-@router.get("/admin/campaigns/{campaign_id:int}")
-def admin_campaign(request: Request, campaign_id: int) -> Response:
+@router.get("/admin/campaigns/{campaign_id}")
+def admin_campaign(request: Request, campaign_id: str) -> Response:
     """One campaign with its rounds."""
     return _page(request, "admin_campaign.html", admin=True, campaign_id=campaign_id)
 
@@ -188,6 +193,8 @@ def _artifact(
     services: UseServices, sha256: str, column: InstrumentedAttribute[str | None], media_type: str
 ) -> FileResponse:
     """A file that some pair shows; episodes and checkpoints, which carry the outcome, are none."""
+    if _SHA256.fullmatch(sha256) is None:
+        raise NotFoundError("file of a pair", sha256)
     with services.database.read() as session:
         if session.scalar(select(Pair.id).where(column == sha256).limit(1)) is None:
             raise NotFoundError("file of a pair", sha256)
@@ -211,29 +218,22 @@ def thumbnail(sha256: str, _me: Anyone, services: UseServices) -> FileResponse:
 
 
 @router.get("/replay-client/")
-def replay_client(request: Request) -> Response:
+def show_replay(request: Request) -> Response:
     """The viewer out of the installed viser package, with our adapter in its head."""
     if _visitor(request) is None:
         raise NotSignedInError("sign in first")
-    page = _replay_client_page()
-    tag = f'"{hashlib.sha256(page).hexdigest()[:32]}"'
+    check_parameters(request.query_params)
+    adapter = (_site() / "static" / "replay-adapter.js").read_bytes()
+    client = replay_client(package_folder("viser") / "client" / "build" / "index.html", adapter)
+    tag = f'"{hashlib.sha256(client.page).hexdigest()[:32]}"'
     headers = {
-        "Content-Security-Policy": REPLAY_CLIENT_POLICY,
+        "Content-Security-Policy": client.policy,
         "Cache-Control": "private, no-cache",
         "ETag": tag,
     }
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    return Response(page, media_type="text/html", headers=headers)
-
-
-def _replay_client_page() -> bytes:
-    page = (package_folder("viser") / "client" / "build" / "index.html").read_bytes()
-    head, found, rest = page.partition(b"</head>")
-    if not found:
-        raise NotFoundError("</head> in the page of the installed viser", "index.html")
-    adapter = (_site() / "static" / "replay-adapter.js").read_bytes()
-    return head + b"<script>" + adapter + b"</script>" + found + rest
+    return Response(client.page, media_type="text/html", headers=headers)
 
 
 @router.get("/vendor/plotly.min.js")

@@ -22,7 +22,8 @@ QUEUE_OF_KIND: dict[JobKind, str] = {
     JobKind.PUBLISH: "finetune",
 }
 TICK_QUEUE = "tick"
-QUEUES = ("rollout", "replay", "finetune", TICK_QUEUE)
+JOB_QUEUES = ("rollout", "replay", "finetune")
+QUEUES = (*JOB_QUEUES, TICK_QUEUE)
 
 # Sends "job <id> of <kind> is ready"; may raise OSError-like broker errors, which callers log:
 # the row is the truth, and the beat's tick sends it again.

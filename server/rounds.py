@@ -220,6 +220,9 @@ def retry_job(session: Session, now: datetime, job_id: int, *, by: int | None) -
     """Queue a failed job again, and take up its round or its pair where it stopped."""
     job = jobs.retry(session, now, job_id)
     if job.round_id is not None:
+        # As a launch does, so that of both at once one wins. Job, campaign, round: the order in
+        # which a publishing step locks them.
+        _locked(session, job.campaign_id)
         failed = session.get_one(Round, job.round_id, with_for_update=True)
         if failed.state == RoundState.FAILED:
             if failed.publish_rule != PublishRule.NEVER:

@@ -17,6 +17,7 @@ class Settings(BaseSettings):
         ".rodif"
     )  # database, broker socket, artifacts, logs of the embedded set-up
     database_url: str = ""  # default sqlite:///<state_dir>/rodif.sqlite3
+    database_connections: int = Field(default=40, ge=1)  # at most, of each process of the API
     broker_url: str = ""  # default redis+socket://<state_dir>/valkey.sock
     artifact_dir: Path | None = None  # default <state_dir>/artifacts
     host: str = "127.0.0.1"

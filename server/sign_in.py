@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from ipaddress import IPv4Address, ip_address, ip_network
 
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
@@ -14,7 +15,8 @@ from server.states import AnnotatorKind, Role
 from server.store.tables import Annotator, ApiToken, BrowserSession, SignInAttempt
 
 THROTTLE_WINDOW = timedelta(minutes=15)
-MAX_FAILURES_PER_NAME = 10  # within the window
+# Within the window. Not by name alone: anybody could then lock anybody out.
+MAX_FAILURES_PER_NAME_AND_ADDRESS = 10
 MAX_FAILURES_PER_ADDRESS = 40  # an office behind one address is not one attacker
 TOKEN_USE_NOTED_EVERY = timedelta(minutes=5)
 
@@ -34,21 +36,35 @@ def me_of(account: Annotator) -> Me:
     return Me(account.id, account.name, Role(account.role), AnnotatorKind(account.kind))
 
 
-def note_attempt(session: Session, now: datetime, *, name: str, address: str) -> None:
+def source_of(host: str | None) -> str:
+    """What attempts are counted by: the address, or the network (/64) that one IPv6 host has."""
+    if host is None:
+        return "unknown"
+    try:
+        address = ip_address(host)
+    except ValueError:  # a unix socket has no address
+        return host[:64]
+    if isinstance(address, IPv4Address):
+        return str(address)
+    return str(address.ipv4_mapped or ip_network((int(address), 64), strict=False))
+
+
+def note_attempt(session: Session, now: datetime, *, name: str, source: str) -> None:
     """Count an attempt before its password is looked at, so that parallel guesses count too.
 
-    Raises ThrottledError when the name or the address has too many failures. Commit this before
-    calling `check_password`; a success clears the name again.
+    Raises ThrottledError when there are too many failures from `source`, with this name or in all.
+    Commit this before calling `check_password`; a success clears the name again.
     """
     since = now - THROTTLE_WINDOW
     session.execute(delete(SignInAttempt).where(SignInAttempt.at < since))
-    for column, value, limit in (
-        (SignInAttempt.name, name, MAX_FAILURES_PER_NAME),
-        (SignInAttempt.address, address, MAX_FAILURES_PER_ADDRESS),
+    from_here = select(func.count(), func.min(SignInAttempt.at)).where(
+        SignInAttempt.address == source
+    )
+    for query, limit in (
+        (from_here.where(SignInAttempt.name == name), MAX_FAILURES_PER_NAME_AND_ADDRESS),
+        (from_here, MAX_FAILURES_PER_ADDRESS),
     ):
-        count, oldest = session.execute(
-            select(func.count(), func.min(SignInAttempt.at)).where(column == value)
-        ).one()
+        count, oldest = session.execute(query).one()
         if count >= limit:
             wait = int((oldest + THROTTLE_WINDOW - now).total_seconds()) + 1
             raise ThrottledError(
@@ -56,7 +72,7 @@ def note_attempt(session: Session, now: datetime, *, name: str, address: str) ->
                 f" try again in {wait} s",
                 retry_after=wait,
             )
-    session.add(SignInAttempt(name=name, address=address, at=now))
+    session.add(SignInAttempt(name=name, address=source, at=now))
 
 
 def check_password(session: Session, name: str, password: str, *, cheap: bool) -> Me:
@@ -68,9 +84,12 @@ def check_password(session: Session, name: str, password: str, *, cheap: bool) -
     return me_of(account)
 
 
-def open_session(session: Session, now: datetime, me: Me, *, lifetime: timedelta) -> str:
-    """Start a browser session and clear the failures of this name; returns the cookie value."""
-    session.execute(delete(SignInAttempt).where(SignInAttempt.name == me.name))
+def open_session(
+    session: Session, now: datetime, me: Me, *, source: str, lifetime: timedelta
+) -> str:
+    """Start a browser session, forget failures of this name from here; returns the cookie value."""
+    mine = (SignInAttempt.name == me.name, SignInAttempt.address == source)
+    session.execute(delete(SignInAttempt).where(*mine))
     secret = new_secret()
     session.add(
         BrowserSession(

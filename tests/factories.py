@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 
 from server.accounts import create_annotator, issue_token
 from server.campaigns import create_campaign
+from server.passwords import hash_password
 from server.schemas.campaigns import CampaignSettings
 from server.sign_in import Me, me_of
 from server.states import AnnotatorKind, Choice, JobKind, PairState, Role
@@ -48,8 +49,9 @@ def add_account(
     kind: AnnotatorKind = AnnotatorKind.PERSON,
 ) -> Annotator:
     """An account with PASSWORD."""
+    password_hash = hash_password(PASSWORD, cheap=True)
     return create_annotator(
-        session, NOW, name=name, role=role, kind=kind, password=PASSWORD, by=None, cheap=True
+        session, NOW, name=name, role=role, kind=kind, password_hash=password_hash, by=None
     )
 
 

@@ -1,7 +1,8 @@
 """Run a command that ends when its starter ends: `leash.py STARTER_PID SIGNAL COMMAND…`.
 
 On Linux the kernel sends SIGNAL to the process when its parent dies, however it dies. The setting
-survives exec. Elsewhere the command simply runs. (Setting it between fork and exec in the
+survives exec. To the kernel the parent is the thread that started the process, so that thread has
+to outlive the process. Elsewhere the command simply runs. (Setting it between fork and exec in the
 starter itself would run Python code in a forked copy of a threaded program.)
 """
 

@@ -37,6 +37,7 @@ class Prepared:
     admin: str
     password: str | None  # shown once: set when it was set now
     campaigns: int
+    active: bool = True  # whether the admin account can sign in
 
 
 def prepare(
@@ -57,8 +58,9 @@ def prepare(
             password = ensure_admin(
                 session, utc_now(), ADMIN, admin_password, cheap=settings.argon2_cheap
             )
+            active = session.scalars(select(Annotator.active).where(Annotator.name == ADMIN)).one()
         register_shipped(settings, database)
-        return Prepared(ADMIN, password, _ensure_campaign(database, first_campaign))
+        return Prepared(ADMIN, password, _ensure_campaign(database, first_campaign), active)
     finally:
         database.dispose()
 

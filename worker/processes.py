@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from server.queue import QUEUES, TICK_QUEUE
+from server.queue import JOB_QUEUES, TICK_QUEUE
 from server.settings import Settings
 
 # One numerical thread per pool child: two children with two threads each were five times slower
@@ -61,10 +61,9 @@ def beat_service(settings: Settings) -> Service:
 
 def embedded_services(settings: Settings, workers: int) -> list[Service]:
     """Everything after the broker: API, job worker, tick worker, beat."""
-    job_queues = tuple(queue for queue in QUEUES if queue != TICK_QUEUE)
     return [
         api_service(settings),
-        worker_service("worker", job_queues, workers),
+        worker_service("worker", JOB_QUEUES, workers),
         worker_service("ticker", (TICK_QUEUE,), 1),
         beat_service(settings),
     ]

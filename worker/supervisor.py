@@ -157,17 +157,22 @@ class System:
         running.restart_at = None
 
     def _watch(self) -> None:
-        """The supervisor's thread: restart what died, give up on what dies again and again."""
+        """The supervisor's thread: restart what died, give up on what dies again and again.
+
+        It lives until everything has ended: with the thread that started a service, the kernel
+        would end the service, too (see `leash`), before it can stop by itself.
+        """
         while not self._stopping.wait(POLL_SECONDS):
             with self._lock:
                 if self._stopping.is_set():
-                    return
+                    break
                 for running in self._services:
                     self._look_at(running)
                 if self.failure is not None:
                     break
         if self.failure is not None:
             self.stop()
+        self._ended.wait()
 
     def _look_at(self, running: _Running) -> None:
         now = time.monotonic()

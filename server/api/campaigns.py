@@ -17,6 +17,7 @@ from server.schemas.campaigns import (
     CampaignOut,
     CampaignPatch,
     CampaignSettings,
+    CampaignToLabel,
     CollectRequest,
     PublicationOut,
     PublishRequest,
@@ -25,6 +26,8 @@ from server.schemas.campaigns import (
 )
 from server.schemas.common import Page
 from server.schemas.rounds import AuditOut, JobOut, TaskOut
+from server.sign_in import Me
+from server.states import Role
 from server.store.paging import page
 from server.store.tables import AuditEntry, Campaign, Publication
 
@@ -32,18 +35,27 @@ router = APIRouter(tags=["campaigns"])
 
 
 @router.get("/tasks")
-def list_tasks(_me: Anyone, session: ReadSession) -> list[TaskOut]:
+def list_tasks(_me: Staff, session: ReadSession) -> list[TaskOut]:
     """Robot tasks that there is a pretrained checkpoint for."""
     return [TaskOut.model_validate(task) for task in checkpoints.list_tasks(session)]
 
 
+def _shown(campaign: Campaign, me: Me) -> CampaignOut | CampaignToLabel:
+    """Annotators are not told which policy they look at, nor how pairs are chosen."""
+    if me.role == Role.ANNOTATOR:
+        return CampaignToLabel.model_validate(campaign)
+    return CampaignOut.model_validate(campaign)
+
+
 @router.get("/campaigns")
-def list_campaigns(_me: Anyone, session: ReadSession, archived: bool = False) -> list[CampaignOut]:
+def list_campaigns(
+    me: Anyone, session: ReadSession, archived: bool = False
+) -> list[CampaignOut | CampaignToLabel]:
     """Campaigns; archived ones on request."""
     query = select(Campaign).order_by(Campaign.id)
     if not archived:
         query = query.where(Campaign.archived.is_(False))
-    return [CampaignOut.model_validate(row) for row in session.scalars(query)]
+    return [_shown(row, me) for row in session.scalars(query)]
 
 
 @router.post("/campaigns", status_code=status.HTTP_201_CREATED)
@@ -65,9 +77,11 @@ def create_campaign(
 
 
 @router.get("/campaigns/{campaign_id}")
-def get_campaign(campaign_id: PathId, _me: Anyone, session: ReadSession) -> CampaignOut:
+def get_campaign(
+    campaign_id: PathId, me: Anyone, session: ReadSession
+) -> CampaignOut | CampaignToLabel:
     """One campaign."""
-    return CampaignOut.model_validate(campaigns.get_campaign(session, campaign_id))
+    return _shown(campaigns.get_campaign(session, campaign_id), me)
 
 
 @router.patch("/campaigns/{campaign_id}")

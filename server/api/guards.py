@@ -5,6 +5,7 @@ from __future__ import annotations
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
+from fastapi.security.utils import get_authorization_scheme_param
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -29,6 +30,16 @@ def is_same_origin(headers: Headers) -> bool:
     return "cookie" not in headers
 
 
+def has_token(headers: Headers) -> bool:
+    """Whether the request carries a bearer token, which then counts instead of any cookie.
+
+    Other credentials prove nothing: behind a proxy that asks for a password, browsers add
+    `Authorization: Basic …` to other sites' requests, too.
+    """
+    scheme, token = get_authorization_scheme_param(headers.get("authorization"))
+    return scheme.lower() == "bearer" and token != ""
+
+
 class SameOriginGuard:
     """Answers 403 to unsafe requests that another site's page may have triggered."""
 
@@ -38,7 +49,7 @@ class SameOriginGuard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http" and scope["method"] not in _SAFE_METHODS:
             headers = Headers(scope=scope)
-            if "authorization" not in headers and not is_same_origin(headers):
+            if not has_token(headers) and not is_same_origin(headers):
                 answer = problem(
                     HTTPStatus.FORBIDDEN,
                     "this request does not come from this site's own pages"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -11,8 +11,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from server.api.services import Services, services_of
 from server.errors import DatabaseVersionError
-from server.queue import ping_broker
-from server.store.beats import BEAT, WORKER, last_beat
+from server.queue import JOB_QUEUES, ping_broker
+from server.store.beats import BEAT, last_beat, last_beats_by_queue
 from server.store.migrate import check_at_head
 
 router = APIRouter(tags=["health"])
@@ -26,7 +26,7 @@ def health() -> dict[str, str]:
 
 @router.get("/ready", responses={503: {"description": "some part is not ready"}})
 def ready(request: Request) -> JSONResponse:
-    """Whether database, broker, worker and beat all work; 503 names the one that does not."""
+    """Whether database, broker, a worker for each queue and beat work; 503 names what does not."""
     services = services_of(request)
     checks = {"database": _database(services), "broker": _broker(services)}
     if checks["database"] == "ok":
@@ -53,17 +53,22 @@ def _broker(services: Services) -> str:
 
 
 def _processes(services: Services) -> dict[str, str]:
-    """Both signs of life are written by ticks that go through the queue, so they come together."""
-    patience = timedelta(seconds=max(30.0, 4 * services.settings.resend_seconds))
-    answers = {}
-    now = services.clock()
+    """Signs of life: of a worker for each queue of jobs, and of the beat.
+
+    The beat's is written by a tick that goes through the queue, so it speaks for the tick worker
+    as well.
+    """
     with services.database.read() as session:
-        for name in (WORKER, BEAT):
-            at = last_beat(session, name)
-            if at is None:
-                answers[name] = "no sign of life yet"
-            elif now - at > patience:
-                answers[name] = f"last sign of life at {at.isoformat()}"
-            else:
-                answers[name] = "ok"
-    return answers
+        by_queue = last_beats_by_queue(session)
+        beat = last_beat(session, BEAT)
+    silent = {queue: _silence(services, by_queue.get(queue)) for queue in JOB_QUEUES}
+    missing = [f"no worker for queue {queue!r}: {why}" for queue, why in silent.items() if why]
+    return {"worker": "; ".join(missing) or "ok", "beat": _silence(services, beat) or "ok"}
+
+
+def _silence(services: Services, at: datetime | None) -> str | None:
+    """What is wrong with the last sign of life, or None."""
+    patience = timedelta(seconds=max(30.0, 4 * services.settings.resend_seconds))
+    if at is None:
+        return "no sign of life yet"
+    return f"last sign of life at {at.isoformat()}" if services.clock() - at > patience else None

@@ -59,18 +59,23 @@ class CampaignPatch(In):
     archived: bool | None = None
 
 
-class CampaignOut(Out):
-    """A campaign."""
+class CampaignToLabel(Out):
+    """What annotators may know of a campaign."""
 
     id: int
     name: str
     task: str
     criterion: str
+    archived: bool
+    created_at: datetime
+
+
+class CampaignOut(CampaignToLabel):
+    """A campaign."""
+
     settings: CampaignSettings
     start_checkpoint_id: int
     published_checkpoint_id: int
-    archived: bool
-    created_at: datetime
 
 
 class CollectRequest(In):

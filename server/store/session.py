@@ -26,21 +26,24 @@ logger = logging.getLogger(__name__)
 # Row lock for `with_for_update`: keeps other writers of the row away, but not inserts of rows that
 # refer to it (FOR NO KEY UPDATE on PostgreSQL; SQLite has one writer at a time anyway).
 LOCK = {"key_share": True}
+CONNECTIONS = 40  # as many as the API has threads for requests
 JOBS_TO_SEND = "jobs_to_send"  # key of Session.info: list[tuple[int, JobKind]]
 _BUSY_TIMEOUT_MS = 15_000  # how long a SQLite writer waits for the one before it
 
 
-def make_engine(url: str, *, foreign_keys: bool = True) -> Engine:
-    """Engine for `sqlite:///…` or `postgresql+psycopg://…`.
+def make_engine(url: str, *, foreign_keys: bool = True, connections: int = CONNECTIONS) -> Engine:
+    """Engine for `sqlite:///…` or `postgresql+psycopg://…`, with at most so many connections.
 
     `foreign_keys=False` is for migrations on SQLite, which rebuild tables.
     """
     parsed = make_url(url)
+    kept = (connections + 1) // 2  # the others are closed when they are no longer used
+    pool = {"pool_size": kept, "max_overflow": connections - kept}
     if parsed.get_backend_name() != "sqlite":
-        return create_engine(parsed, pool_size=20, max_overflow=20, pool_pre_ping=True)
+        return create_engine(parsed, **pool, pool_pre_ping=True)
     if parsed.database:
         Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(parsed, pool_size=20, max_overflow=20)
+    engine = create_engine(parsed, **pool)
 
     @event.listens_for(engine, "connect")
     def _configure(connection: Any, _record: Any) -> None:
@@ -75,9 +78,11 @@ def _use_write_ahead_log(connection: sqlite3.Connection) -> None:
 class Database:
     """Sessions of one database. Make one per process, after any fork."""
 
-    def __init__(self, url: str, send_job: SendJob | None = None) -> None:
+    def __init__(
+        self, url: str, send_job: SendJob | None = None, *, connections: int = CONNECTIONS
+    ) -> None:
         self.url = url
-        self.engine = make_engine(url)
+        self.engine = make_engine(url, connections=connections)
         self._send_job = send_job
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         reader = self.engine.execution_options(read_only=True)

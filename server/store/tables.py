@@ -1,7 +1,8 @@
 """All SQL tables. Rows are the truth; files hold only what SQL points to by SHA-256.
 
 Timestamps are aware and in UTC. JSON columns hold plain JSON types. Labels, simulated truth,
-publications and audit rows are append-only: triggers in the migrations refuse UPDATE and DELETE.
+publications, events and audit rows are append-only: triggers in the migrations refuse UPDATE and
+DELETE.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ class ApiToken(Base):
 
 
 class SignInAttempt(Base):
-    """One failed sign-in, for throttling by account name and by address."""
+    """One failed sign-in, for throttling by name and address (`sign_in.source_of`)."""
 
     __tablename__ = "sign_in_attempt"
     id: Mapped[int] = mapped_column(primary_key=True)

@@ -90,7 +90,8 @@ def test_every_process_starts_and_all_pages_are_in_the_wheel(installed: Path, tm
         assert "password" in browser.get("/sign-in").text
         account = {"name": "admin", "password": PASSWORD}
         assert browser.post("/api/v1/session", json=account).status_code == 200
-        for path in ("/admin", "/replay-client/", "/vendor/plotly.min.js"):
+        replay = f"/replay-client/?playbackPath=/replays/{'0' * 64}.viser"
+        for path in ("/admin", replay, "/vendor/plotly.min.js"):
             answer = browser.get(path)
             assert answer.status_code == 200 and len(answer.content) > 500, path
         folder = ROOT / "labeling_ui" / "site" / "static"

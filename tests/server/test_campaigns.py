@@ -46,8 +46,28 @@ def test_a_campaign_takes_its_defaults_from_the_task(world: World, checkpoint_id
     }
     history = world.client("ada").get("/campaigns/1/publications").json()
     assert [(row["action"], row["checkpoint_id"]) for row in history] == [("start", checkpoint_id)]
-    (task,) = world.client("ann").get("/tasks").json()
+    (task,) = world.client("sam").get("/tasks").json()
     assert (task["name"], task["preferred_group"], task["checkpoints"]) == ("avoid", "left", 1)
+
+
+def test_annotators_are_told_of_no_policy_and_no_preferred_behaviour(sqlite_world: World) -> None:
+    campaign_id, _ = sqlite_world.add_campaign(pairs=1)
+    ann = sqlite_world.client("ann")
+    told = {
+        "id": campaign_id,
+        "name": "campaign 0",
+        "task": "avoid",
+        "criterion": factories.TASK_FACTS["criterion"],
+        "archived": False,
+        "created_at": "2026-11-22T12:00:00Z",
+    }
+    assert ann.get("/campaigns").json() == [told]
+    assert ann.get(f"/campaigns/{campaign_id}").json() == told
+    assert ann.get("/tasks").status_code == 403
+    pair = ann.post(f"/campaigns/{campaign_id}/next", json={}).json()["pair"]
+    assert set(pair) == {
+        *("id", "replay_url", "thumbnail_url", "left_label", "right_label", "duration_s")
+    }
 
 
 @pytest.mark.parametrize(

@@ -351,6 +351,26 @@ def test_truth_of_simulated_annotators_is_kept_apart(world: World) -> None:
     assert raw["source"] == "simulated" and "true_choice" not in raw
 
 
+def test_the_truth_told_twice_at_once_is_stored_once(world: World) -> None:
+    campaign_id, _ = world.add_campaign(pairs=2)
+    label = _post(world, "sam", _body(_handed(world, "sam", campaign_id))).json()
+    truth = {"true_choice": "left", "corruption": "none", "criterion": "x"}
+    path = f"/labels/{label['id']}/truth"
+    answers = at_once([lambda: world.client("sam").put(path, json=truth)] * 6)
+    assert sorted(answer.status_code for answer in answers) == [200] * 5 + [201]
+
+    label = _post(world, "sam", _body(_handed(world, "sam", campaign_id)), key="k2").json()
+    path = f"/labels/{label['id']}/truth"
+    other = truth | {"true_choice": "right"}
+    answers = at_once(
+        [
+            lambda: world.client("sam").put(path, json=truth),
+            lambda: world.client("sam").put(path, json=other),
+        ]
+    )
+    assert sorted(answer.status_code for answer in answers) == [201, 409]
+
+
 def test_people_have_no_truth_to_tell_and_cannot_see_it(world: World) -> None:
     campaign_id, _ = world.add_campaign(pairs=2)
     handed = _handed(world, "ann", campaign_id)

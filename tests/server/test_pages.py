@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import re
 
 import pytest
 
-from server.pages import REPLAY_CLIENT_POLICY
 from server.store.tables import Pair
 from tests.server.world import World
 
@@ -32,6 +32,27 @@ def test_everybody_has_a_home(sqlite_world: World, name: str, home: str) -> None
     for path in ("/", "/sign-in"):
         answer = browser.get(path, follow_redirects=False)
         assert (answer.status_code, answer.headers["location"]) == (303, home)
+
+
+@pytest.mark.parametrize(
+    ("asked", "goal"),
+    [
+        ("/label/1", "/label/1"),
+        ("/label/1%3Fview%3Dtop%26x%3Da%2520b", "/label/1?view=top&x=a%20b"),
+        ("//evil.example", "/admin"),
+        ("/%5Cevil.example", "/admin"),
+        ("/%09/evil.example", "/%09/evil.example"),  # a path of this site that does not exist
+        ("https://evil.example/label", "/admin"),
+        ("label", "/admin"),
+        ("", "/admin"),
+    ],
+)
+def test_who_is_signed_in_goes_on_to_what_was_asked_for_on_this_site(
+    sqlite_world: World, asked: str, goal: str
+) -> None:
+    browser = sqlite_world.signed_in("ada")
+    answer = browser.get(f"/sign-in?next={asked}", follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, goal)
 
 
 @pytest.mark.parametrize("path", ["/sign-in", *PAGES])
@@ -73,6 +94,14 @@ def test_a_page_of_an_unknown_campaign_says_so(sqlite_world: World) -> None:
     assert answer.status_code == 404 and "no campaign 99" in answer.text
     assert 'class="brand"' in answer.text
     assert sqlite_world.signed_in("ann").get("/label/abc").status_code == 404
+
+
+@pytest.mark.parametrize("number", ["0", str(2**31), "9" * 20, "9" * 5000, "-1", "1.5", "%00", "²"])
+def test_what_no_database_takes_for_a_number_is_no_campaign(world: World, number: str) -> None:
+    browser = world.signed_in("ada")
+    for path in (f"/label/{number}", f"/admin/campaigns/{number}"):
+        answer = browser.get(path)
+        assert answer.status_code == 404 and "There is no campaign" in answer.text
 
 
 def test_unknown_addresses_answer_people_with_a_page_and_scripts_with_json(
@@ -137,24 +166,79 @@ def test_browsers_ask_for_site_files_each_time(sqlite_world: World) -> None:
     assert (again.status_code, again.headers["cache-control"]) == (304, "no-cache")
 
 
-@pytest.mark.parametrize("name", ["..%2f..%2frodif", "A" * 64, "short"])
-def test_a_replay_that_is_no_hash_is_not_found(sqlite_world: World, name: str) -> None:
-    assert sqlite_world.signed_in("ann").get(f"/replays/{name}.viser").status_code == 404
+@pytest.mark.parametrize("name", ["..%2f..%2frodif", "A" * 64, "short", "%00", "%ed%a0%80"])
+def test_a_replay_that_is_no_hash_is_not_found(world: World, name: str) -> None:
+    browser = world.signed_in("ann")
+    for path in (f"/replays/{name}.viser", f"/thumbnails/{name}.webp"):
+        assert browser.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("name", ["%00", "x" * 5000, "%ed%a0%80"])
+def test_an_odd_name_of_a_site_file_is_not_found(sqlite_world: World, name: str) -> None:
+    assert sqlite_world.browser().get(f"/static/{name}").status_code == 404
+
+
+REPLAY = f"/replays/{'0' * 64}.viser"
 
 
 def test_the_replay_client_is_the_installed_one_with_our_adapter(sqlite_world: World) -> None:
-    assert sqlite_world.browser().get("/replay-client/").status_code == 401
+    address = f"/replay-client/?playbackPath={REPLAY}&logCamera=1&start=paused"
+    assert sqlite_world.browser().get(address).status_code == 401
     browser = sqlite_world.signed_in("ann")
-    answer = browser.get("/replay-client/")
+    answer = browser.get(address)
     assert answer.status_code == 200
-    assert answer.headers["content-security-policy"] == REPLAY_CLIENT_POLICY
-    assert "'unsafe-eval'" not in REPLAY_CLIENT_POLICY
     adapter = browser.get("/static/replay-adapter.js").text
     head, found, _rest = answer.text.partition(f"<script>{adapter}</script></head>")
     assert found and "<body" not in head
     assert len(answer.content) > 500_000
-    again = browser.get("/replay-client/", headers={"If-None-Match": answer.headers["etag"]})
+    again = browser.get(address, headers={"If-None-Match": answer.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
+
+
+def test_the_replay_clients_policy_names_the_scripts_of_the_page_and_no_others(
+    sqlite_world: World,
+) -> None:
+    answer = sqlite_world.signed_in("ann").get(f"/replay-client/?playbackPath={REPLAY}")
+    policy = answer.headers["content-security-policy"]
+    (sources,) = re.findall(r"script-src ([^;]+);", policy)
+    assert policy.startswith("default-src 'none';")
+    named = set(sources.split()) - {"'wasm-unsafe-eval'"}
+    assert all(re.fullmatch(r"'sha256-[0-9A-Za-z+/]{43}='", source) for source in named)
+    scripts = re.findall(r"<script[^>]*>(.+?)</script>", answer.text, flags=re.DOTALL)
+    digests = [hashlib.sha256(script.encode()).digest() for script in scripts]
+    on_page = {f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests}
+    assert len(on_page) == 2 and on_page < named
+    assert len(named) == 3  # the third is what the client unpacks, as a browser test shows
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "",
+        "?playbackPath=",
+        "?playbackPath=data:application/octet-stream;base64,AAAA",
+        "?playbackPath=https://example.org/a.viser",
+        f"?playbackPath=//example.org{REPLAY}",
+        f"?playbackPath=/label/..{REPLAY}",
+        f"?playbackPath={REPLAY}%0A",
+        f"?playbackPath={REPLAY.upper()}",
+        f"?playbackPath={REPLAY}&playbackPath={REPLAY}",
+        f"?playbackPath={REPLAY}&%70laybackPath=data:,",
+        f"?playbackPath={REPLAY}&websocket=ws://example.org",
+        f"?playbackPath={REPLAY}&websocket",
+    ],
+)
+def test_the_replay_client_shows_nothing_but_one_recording_of_this_site(
+    sqlite_world: World, query: str
+) -> None:
+    answer = sqlite_world.signed_in("ann").get(f"/replay-client/{query}")
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    (error,) = answer.json()["errors"]
+    assert (error["field"], error["legal"]) in (
+        ("playbackPath", "one /replays/<sha256>.viser"),
+        ("websocket", "absent"),
+    )
 
 
 def test_plotly_comes_out_of_the_installed_package(sqlite_world: World) -> None:

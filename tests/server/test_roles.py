@@ -28,7 +28,7 @@ ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/tokens", None, ALL),
     ("POST", "/tokens", {"name": "x"}, ALL),
     ("DELETE", "/tokens/999", None, ALL),
-    ("GET", "/tasks", None, ALL),
+    ("GET", "/tasks", None, STAFF),
     ("GET", "/campaigns", None, ALL),
     ("POST", "/campaigns", {"name": "x", "task": "avoid"}, STAFF),
     ("GET", "/campaigns/1", None, ALL),

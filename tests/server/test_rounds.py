@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from typing import Any
 
@@ -293,6 +294,25 @@ def test_retrying_a_failed_job_takes_up_its_round(world: World) -> None:
     assert client.post(f"/jobs/{job.id}/retry").status_code == 409
     states = [row["state"] for row in client.get("/jobs?state=queued").json()]
     assert states and set(states) == {"queued"}
+
+
+def test_a_retry_waits_for_a_launch_and_is_refused_beside_it(world: World) -> None:
+    campaign_id = _labelled(world)
+    round_id = _launch(world, campaign_id).json()["id"]
+    with world.database.write() as session:
+        job = session.scalars(select(Job).where(Job.round_id == round_id)).one()
+        job.state = JobState.FAILED
+        rounds.move(session, NOW, round_id, RoundState.FAILED, error="disk full")
+    with ThreadPoolExecutor(1) as pool:
+        with world.database.write() as session:
+            launched = rounds.launch(session, NOW, campaign_id, RoundRequest())
+            retry = pool.submit(lambda: world.client("sam").post(f"/jobs/{job.id}/retry"))
+            with pytest.raises(TimeoutError):
+                retry.result(timeout=0.5)  # until the launch is stored, nobody knows of it
+        answer = retry.result(timeout=30)
+    assert answer.status_code == 409
+    assert f"round {launched.id} of campaign {campaign_id}" in answer.json()["detail"]
+    assert world.client("sam").get(f"/jobs/{job.id}").json()["state"] == "failed"
 
 
 def test_retrying_a_failed_replay_makes_its_pair_wait_again(world: World) -> None:

@@ -17,6 +17,7 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+from sqlalchemy import select
 from starlette.testclient import TestClient
 
 from server import pages
@@ -24,6 +25,7 @@ from server.bootstrap import ensure_admin, register_checkpoint
 from server.errors import ConflictError
 from server.store.artifacts import ArtifactStore
 from server.store.session import Database
+from server.store.tables import Annotator
 from tests import factories
 from tests.factories import NOW
 from tests.server.world import World
@@ -62,7 +64,7 @@ def test_every_endpoint_is_named_in_the_documentation(sqlite_world: World) -> No
 
 def test_every_page_and_file_route_is_named_in_the_documentation() -> None:
     text = (ROOT / "docs" / "api.md").read_text()
-    routes = {getattr(route, "path", "").replace(":int", "") for route in pages.router.routes}
+    routes = {getattr(route, "path", "") for route in pages.router.routes}
     assert {path for path in routes if f"`{path}`" not in text} == set()
 
 
@@ -162,6 +164,10 @@ def test_bootstrapping_twice_changes_nothing(database: Database, tmp_path: Path)
         assert password is not None and len(password) >= 16
         assert ensure_admin(session, NOW + timedelta(days=1), cheap=True) is None
         assert ensure_admin(session, NOW, password="given by hand", cheap=True) == "given by hand"
+        admin = session.scalars(select(Annotator)).one()
+        admin.active = False
+        assert ensure_admin(session, NOW, cheap=True) is None and not admin.active
+        assert ensure_admin(session, NOW, password="by hand again", cheap=True) and admin.active
         factories.add_account(session, "ann")
         with pytest.raises(ConflictError, match="'ann' has role 'annotator'"):
             ensure_admin(session, NOW, name="ann")

@@ -6,10 +6,16 @@ import hashlib
 
 import pytest
 from sqlalchemy import select
+from starlette.testclient import TestClient
 
-from server.sign_in import MAX_FAILURES_PER_ADDRESS, MAX_FAILURES_PER_NAME
+from server.passwords import hash_password
+from server.sign_in import (
+    MAX_FAILURES_PER_ADDRESS,
+    MAX_FAILURES_PER_NAME_AND_ADDRESS,
+    source_of,
+)
 from server.store.tables import AuditEntry, BrowserSession
-from tests.factories import PASSWORD
+from tests.factories import PASSWORD, add_account
 from tests.server.world import World
 
 SIGN_IN = "/api/v1/session"
@@ -71,9 +77,14 @@ def test_wrong_credentials_say_the_same(sqlite_world: World, body: dict[str, str
     assert "set-cookie" not in answer.headers
 
 
-def test_guessing_a_password_is_throttled_by_name_and_then_forgiven(world: World) -> None:
+def _at(browser: TestClient, address: str) -> TestClient:
+    """The same application, asked from another address."""
+    return TestClient(browser.app, headers=browser.headers, client=(address, 50000))
+
+
+def test_guessing_a_password_is_throttled_and_then_forgiven(world: World) -> None:
     browser = world.browser()
-    for _ in range(MAX_FAILURES_PER_NAME):
+    for _ in range(MAX_FAILURES_PER_NAME_AND_ADDRESS):
         assert browser.post(SIGN_IN, json=WRONG).status_code == 401
     answer = browser.post(SIGN_IN, json=RIGHT)  # even the right one now
     assert answer.status_code == 429
@@ -85,12 +96,37 @@ def test_guessing_a_password_is_throttled_by_name_and_then_forgiven(world: World
     assert browser.post(SIGN_IN, json=WRONG).status_code == 401  # counting starts anew
 
 
+def test_nobody_is_locked_out_by_guesses_from_elsewhere(sqlite_world: World) -> None:
+    guesser = _at(sqlite_world.browser(), "203.0.113.7")
+    for _ in range(MAX_FAILURES_PER_NAME_AND_ADDRESS):
+        assert guesser.post(SIGN_IN, json=WRONG).status_code == 401
+    owner = _at(sqlite_world.browser(), "192.0.2.1")
+    assert owner.post(SIGN_IN, json=RIGHT).status_code == 200
+    assert guesser.post(SIGN_IN, json=RIGHT).status_code == 429
+
+
 def test_guessing_many_names_is_throttled_by_address(sqlite_world: World) -> None:
     browser = sqlite_world.browser()
     for index in range(MAX_FAILURES_PER_ADDRESS):
         body = {"name": f"guess{index}", "password": PASSWORD}
         assert browser.post(SIGN_IN, json=body).status_code == 401
     assert browser.post(SIGN_IN, json=RIGHT).status_code == 429
+    assert _at(browser, "192.0.2.1").post(SIGN_IN, json=RIGHT).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("host", "source"),
+    [
+        ("192.0.2.1", "192.0.2.1"),
+        ("::ffff:192.0.2.1", "192.0.2.1"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("testclient", "testclient"),
+        (None, "unknown"),
+    ],
+)
+def test_attempts_are_counted_by_what_one_host_has(host: str | None, source: str) -> None:
+    assert source_of(host) == source
 
 
 def test_a_deactivated_account_is_out_at_once_everywhere(world: World) -> None:
@@ -101,17 +137,47 @@ def test_a_deactivated_account_is_out_at_once_everywhere(world: World) -> None:
     assert browser.get("/api/v1/me").status_code == 401
     assert script.get("/me").status_code == 401
     assert world.browser().post(SIGN_IN, json=RIGHT).status_code == 401
+    path = f"/annotators/{world.ids['ann']}"
+    assert world.client("ada").patch(path, json={"active": True}).status_code == 200
+    assert browser.get("/api/v1/me").status_code == 401
+    assert "this token was revoked" in script.get("/me").json()["detail"]
+    assert world.browser().post(SIGN_IN, json=RIGHT).status_code == 200
 
 
-def test_a_new_password_signs_browsers_out(sqlite_world: World) -> None:
-    browser = sqlite_world.signed_in("ann")
-    admin = sqlite_world.client("ada")
-    path = f"/annotators/{sqlite_world.ids['ann']}"
+def test_a_new_password_ends_sessions_and_tokens_of_this_account_only(world: World) -> None:
+    browser, script = world.signed_in("ann"), world.client("ann")
+    admin = world.client("ada")
+    path = f"/annotators/{world.ids['ann']}"
+    assert admin.patch(path, json={"role": "annotator"}).status_code == 200
+    assert script.get("/me").status_code == 200
     assert admin.patch(path, json={"password": "quite another one"}).status_code == 200
     assert browser.get("/api/v1/me").status_code == 401
-    assert sqlite_world.browser().post(SIGN_IN, json=RIGHT).status_code == 401
+    assert "this token was revoked" in script.get("/me").json()["detail"]
+    assert world.client("bob").get("/me").status_code == 200
+    assert world.browser().post(SIGN_IN, json=RIGHT).status_code == 401
     body = {"name": "ann", "password": "quite another one"}
-    assert sqlite_world.browser().post(SIGN_IN, json=body).status_code == 200
+    assert world.browser().post(SIGN_IN, json=body).status_code == 200
+
+
+def test_others_can_write_while_a_password_is_hashed(
+    sqlite_world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed = []
+
+    def hash_while_others_write(password: str, *, cheap: bool) -> str:
+        with sqlite_world.database.write() as session:  # SQLite has one writer at a time
+            add_account(session, f"other {len(hashed)}")
+        hashed.append(password)
+        return hash_password(password, cheap=cheap)
+
+    monkeypatch.setattr("server.api.accounts.hash_password", hash_while_others_write)
+    admin = sqlite_world.client("ada")
+    body = {"name": "new", "role": "annotator", "password": "secret-secret"}
+    made = admin.post("/annotators", json=body)
+    assert made.status_code == 201
+    changed = admin.patch(f"/annotators/{made.json()['id']}", json={"password": "other-secret"})
+    assert changed.status_code == 200
+    assert hashed == ["secret-secret", "other-secret"]
 
 
 def test_the_last_admin_cannot_be_locked_out(world: World) -> None:
@@ -150,12 +216,19 @@ def test_a_revoked_token_is_refused(sqlite_world: World) -> None:
 
 def test_annotators_handle_their_own_tokens_only(sqlite_world: World) -> None:
     ann = sqlite_world.client("ann")
-    assert ann.post("/tokens", json={"name": "mine"}).status_code == 201
+    assert ann.post("/tokens", json={"name": "mine", "days": 90}).status_code == 201
+    for_years = ann.post("/tokens", json={"name": "mine", "days": 3650})
+    assert for_years.status_code == 422
+    assert "days is 3650.0, but must be at most 90" in for_years.json()["detail"]
+    body = {"name": "theirs", "days": 3650, "annotator_id": sqlite_world.ids["ann"]}
+    issued = sqlite_world.client("ada").post("/tokens", json=body)
+    assert issued.status_code == 201
+    assert ann.delete(f"/tokens/{issued.json()['id']}").status_code == 204
     other = {"annotator_id": sqlite_world.ids["bob"], "name": "not mine"}
     assert ann.post("/tokens", json=other).status_code == 403
     bobs = sqlite_world.client("bob").get("/tokens?mine=true").json()[0]["id"]
     assert ann.delete(f"/tokens/{bobs}").status_code == 403
-    assert len(sqlite_world.client("ada").get("/tokens").json()) == 5
+    assert len(sqlite_world.client("ada").get("/tokens").json()) == 6
     assert len(sqlite_world.client("ada").get("/tokens?mine=true").json()) == 1
 
 
@@ -178,6 +251,10 @@ def test_an_unknown_token_is_refused(sqlite_world: World, token: str) -> None:
         ({"Origin": "http://testserver.evil.example"}, False),
         ({"Origin": "null"}, False),
         ({}, False),
+        ({"Authorization": "Basic YWRhOnNlY3JldA==", "Sec-Fetch-Site": "cross-site"}, False),
+        ({"Authorization": "Basic YWRhOnNlY3JldA==", "Sec-Fetch-Site": "same-origin"}, True),
+        ({"Authorization": "Bearer", "Sec-Fetch-Site": "cross-site"}, False),
+        ({"Authorization": "Bearer ", "Origin": "http://evil.example"}, False),
     ],
 )
 def test_a_cookie_counts_only_on_requests_from_our_own_pages(

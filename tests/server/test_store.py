@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from server.errors import ArtifactError
 from server.states import JobKind
 from server.store import jobs
 from server.store.artifacts import ArtifactStore
-from server.store.beats import last_beat, record_beat
+from server.store.beats import last_beat, last_beats_by_queue, record_beat
 from server.store.events import add_event, events_after
 from server.store.paging import page
 from server.store.session import Database
@@ -92,22 +93,27 @@ def test_many_threads_that_read_and_then_write_all_succeed(database: Database) -
 def test_times_come_back_aware_and_naive_ones_are_refused(database: Database) -> None:
     tokyo = datetime.fromisoformat("2026-11-22T21:00:00.123456+09:00")
     with database.write() as session:
-        record_beat(session, tokyo, "worker@one")
+        record_beat(session, tokyo, "beat")
     with database.read() as session:
-        found = last_beat(session, "worker")
+        found = last_beat(session, "beat")
     assert found == tokyo and found is not None and found.tzinfo == UTC
     with pytest.raises(StatementError, match="naive datetime"), database.write() as session:
         record_beat(session, datetime(2026, 1, 1), "worker")
 
 
-def test_the_newest_sign_of_life_of_several_workers_counts(database: Database) -> None:
+def test_the_newest_sign_of_life_of_the_workers_of_each_queue_counts(database: Database) -> None:
     with database.write() as session:
-        record_beat(session, NOW, "worker@one")
-        record_beat(session, NOW + timedelta(seconds=5), "worker@two")
-        record_beat(session, NOW + timedelta(seconds=9), "workerless")
-        record_beat(session, NOW + timedelta(seconds=1), "worker@one", {"jobs": 2})
+        both, one = {"queues": ["replay", "rollout"]}, {"queues": ["replay"]}
+        record_beat(session, NOW, "worker@one", one)
+        record_beat(session, NOW + timedelta(seconds=5), "worker@two", one)
+        record_beat(session, NOW + timedelta(seconds=9), "workerless", both)
+        record_beat(session, NOW + timedelta(seconds=1), "worker@one", both)
+        record_beat(session, NOW + timedelta(seconds=9), "worker@three")
     with database.read() as session:
-        assert last_beat(session, "worker") == NOW + timedelta(seconds=5)
+        assert last_beats_by_queue(session) == {
+            "replay": NOW + timedelta(seconds=5),
+            "rollout": NOW + timedelta(seconds=1),
+        }
         assert last_beat(session, "beat") is None
 
 
@@ -196,3 +202,20 @@ def test_an_interrupted_write_leaves_nothing(
     with pytest.raises(OSError, match="disk full"):
         store.put(b"half")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_database_opens_no_more_connections_than_it_may(database_url: str) -> None:
+    limited = Database(database_url, connections=3)
+
+    def ask() -> int | None:
+        with limited.read() as session:
+            return session.scalar(select(1))
+
+    with ThreadPoolExecutor(1) as pool:
+        with limited.read() as one, limited.read() as two, limited.read() as three:
+            assert [session.scalar(select(1)) for session in (one, two, three)] == [1, 1, 1]
+            fourth = pool.submit(ask)
+            with pytest.raises(TimeoutError):
+                fourth.result(timeout=0.5)
+        assert fourth.result(timeout=30) == 1
+    limited.dispose()

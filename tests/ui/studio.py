@@ -26,6 +26,7 @@ from server.accounts import create_annotator
 from server.app import create_app
 from server.bootstrap import ensure_admin, register_checkpoint
 from server.campaigns import create_campaign
+from server.passwords import hash_password
 from server.schemas.campaigns import CampaignSettings
 from server.settings import Settings
 from server.states import AnnotatorKind, JobKind, JobState, PairState, Role
@@ -77,9 +78,8 @@ class Studio:
                 name=name,
                 role=role,
                 kind=AnnotatorKind.PERSON,
-                password=PASSWORD,
+                password_hash=hash_password(PASSWORD, cheap=True),
                 by=None,
-                cheap=True,
             )
         return name
 

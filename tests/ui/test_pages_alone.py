@@ -12,16 +12,21 @@ from tests.ui.studio import Studio
 
 pytestmark = pytest.mark.browser
 
-# viser's client, which is not ours, warns and tries `eval` for a feature that replays do not use.
-KNOWN = ("THREE.Clock", "GL Driver Message", "Violates", "violates", "Detected chrome", "WebGL")
+# viser's client, which is not ours, warns, and tries `eval` for a feature that replays do not use.
+KNOWN = ("THREE.Clock", "GL Driver Message", "WebGL")
+KNOWN_REFUSAL = ("/replay-client/", "script-src", "eval")
+# The event says in which frame the policy refused what; console and page errors do not.
+TELL_REFUSALS = """addEventListener("securitypolicyviolation", (event) =>
+  window.tellRefusal([location.pathname, event.effectiveDirective, event.blockedURI]))"""
 
 
 class Witness:
-    """Notes foreign addresses, errors and warnings of a page."""
+    """Notes foreign addresses, errors, warnings and what the policy refused on a page."""
 
     def __init__(self, page: Page, studio: Studio) -> None:
         self.foreign: list[str] = []
         self.complaints: list[str] = []
+        self.refusals: set[tuple[str, ...]] = set()
         allowed = (studio.url, "blob:", "data:")
         page.on(
             "request",
@@ -31,13 +36,16 @@ class Witness:
         )
         page.on("console", self._note)
         page.on("pageerror", lambda error: self._note_text(str(error)))
+        page.expose_function("tellRefusal", lambda refused: self.refusals.add(tuple(refused)))
+        page.add_init_script(TELL_REFUSALS)
 
     def _note(self, message: ConsoleMessage) -> None:
         if message.type in ("error", "warning"):
             self._note_text(message.text)
 
     def _note_text(self, text: str) -> None:
-        if not any(known in text for known in KNOWN):
+        told_by_event = "following Content Security Policy directive" in text
+        if not told_by_event and not any(known in text for known in KNOWN):
             self.complaints.append(text)
 
 
@@ -49,6 +57,15 @@ def test_annotators_page_loads_from_its_own_server_only(
     driver.wait_state("state.t > 0")
     assert witness.foreign == []
     assert witness.complaints == []
+    assert witness.refusals <= {KNOWN_REFUSAL}
+
+
+def test_what_the_policy_refuses_on_a_page_is_noticed(studio: Studio, page: Page) -> None:
+    witness = Witness(page, studio)
+    page.goto(f"{studio.url}/sign-in")
+    page.evaluate("document.querySelector('form').setAttribute('onclick', 'alert(1)')")
+    page.wait_for_timeout(500)
+    assert witness.refusals == {("/sign-in", "script-src-attr", "inline")}
 
 
 @pytest.mark.parametrize("path", ["/sign-in", "/label", "/admin", "/admin/campaigns/{id}"])
@@ -64,6 +81,7 @@ def test_other_pages_load_from_their_own_server_only(studio: Studio, page: Page,
     assert page.locator("h1, .brand").first.is_visible()
     assert witness.foreign == []
     assert witness.complaints == []
+    assert witness.refusals == set()
 
 
 @pytest.mark.parametrize("path", ["/sign-in", "/label", "/admin", "/admin/campaigns/{id}"])

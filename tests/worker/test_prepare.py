@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
 from rodif_core.policies.checkpoint import (
     CheckpointFileError,
@@ -20,6 +21,7 @@ from server.store.session import Database
 from server.store.tables import Annotator, Campaign, Checkpoint
 from tests.core.learning import tiny_checkpoint
 from worker import prepare as preparing
+from worker.cli.up import how_to_sign_in
 from worker.prepare import Prepared, prepare
 
 TINY = save_checkpoint(tiny_checkpoint())
@@ -52,6 +54,18 @@ def settings(
     _ship(monkeypatch, TINY)
     shutil.copytree(first_time[0], tmp_path / "state")
     return _settings(tmp_path / "state")
+
+
+def test_a_deactivated_admin_is_not_asked_to_sign_in_until_a_password_is_given(
+    settings: Settings,
+) -> None:
+    database = Database(settings.database_url)
+    with database.write() as session:
+        session.scalars(select(Annotator)).one().active = False
+    database.dispose()
+    assert "admin is deactivated" in how_to_sign_in(prepare(settings), given=False)
+    again = prepare(settings, admin_password="given by hand")
+    assert again.active and "Sign in as admin" in how_to_sign_in(again, given=True)
 
 
 def _rows(settings: Settings) -> tuple[list[str], list[Checkpoint], list[Campaign]]:

@@ -57,6 +57,7 @@ def test_compose_workers_serve_every_queue_and_keep_the_pool_rules(compose: dict
 
 def test_compose_sets_only_settings_that_exist(compose: dict[str, Any]) -> None:
     known = {f"RODIF_{name.upper()}" for name in Settings.model_fields} | {"RODIF_ADMIN_PASSWORD"}
+    known |= {"FORWARDED_ALLOW_IPS"}  # uvicorn's own
     for service in _built(compose).values():
         assert set(service["environment"]) <= known
 

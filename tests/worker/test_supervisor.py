@@ -47,16 +47,27 @@ def _wait_for(condition: Callable[[], bool], what: str, seconds: float = 60.0) -
         time.sleep(0.05)
 
 
-def test_dead_service_is_started_again(system: System) -> None:
-    system.start(SLEEPER)
+def test_dead_service_is_started_again_and_stops_in_its_own_time(system: System) -> None:
+    # It needs a moment to stop, as a worker does that hands its work back.
+    code = (
+        "import signal, sys, time\n"
+        "def stop(*_): time.sleep(0.5); print('stopped by itself', flush=True); sys.exit()\n"
+        "signal.signal(signal.SIGTERM, stop); print('on', flush=True); time.sleep(600)\n"
+    )
+    system.start(Service("tidy", (sys.executable, "-S", "-c", code)))
+    log = system.settings.state_dir / "logs" / "tidy.log"
+    _wait_for(lambda: "on" in log.read_text(), "the service is up")
+    log.write_text("")
     system.watch()
     try:
-        first = system.pid("sleeper")
+        first = system.pid("tidy")
         os.kill(first, signal.SIGKILL)
-        _wait_for(lambda: system.runs("sleeper") and system.pid("sleeper") != first, "restart")
+        _wait_for(lambda: system.runs("tidy") and system.pid("tidy") != first, "restart")
+        _wait_for(lambda: "on" in log.read_text(), "the restarted service is up")
     finally:
         system.stop()
-    assert not system.runs("sleeper")
+    assert not system.runs("tidy")
+    assert log.read_text().endswith("stopped by itself\n")
 
 
 def test_everything_stops_with_the_log_shown_when_a_service_crashes_again_and_again(

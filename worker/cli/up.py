@@ -60,6 +60,11 @@ def how_to_sign_in(prepared: Prepared, *, given: bool) -> str:
         return f"Sign in as {prepared.admin} with the password in RODIF_ADMIN_PASSWORD."
     if prepared.password is not None:
         return f"Sign in as {prepared.admin} with password {prepared.password} (shown only now)."
+    if not prepared.active:
+        return (
+            f"Account {prepared.admin} is deactivated; another admin can activate it,"
+            " and so does a start with RODIF_ADMIN_PASSWORD."
+        )
     return (
         f"Sign in as {prepared.admin} with the password shown at the first start;"
         " to set a new one, start with RODIF_ADMIN_PASSWORD."

@@ -51,18 +51,19 @@ export async function addPerson() {
 async function setPassword(person) {
   const done = await ask({
     title: `New password for ${person.name}`,
-    text: "Signs this person out everywhere.",
+    text: "Signs this person out everywhere and revokes all tokens of the account.",
     confirm: "Set password",
     fields: [{ name: "password", label: "Password", kind: "password", required: true, hint: PASSWORD_HINT }],
     onSubmit: ({ password }) => patch(person, { password }),
   });
   if (done) toast("The password is changed.");
+  await drawPeople();
 }
 
 async function deactivate(person) {
   await ask({
     title: `Deactivate ${person.name}?`,
-    text: "This person is signed out and cannot come back until activated again. All labels stay.",
+    text: "This person is signed out and cannot come back until activated again. Tokens are revoked for good; all labels stay.",
     confirm: "Deactivate",
     danger: true,
     onSubmit: () => patch(person, { active: false }),
