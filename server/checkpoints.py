@@ -8,12 +8,12 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Row, select
 from sqlalchemy.orm import Session
 
 from server.errors import NotFoundError
-from server.store.labels import snapshot_labels
-from server.store.tables import Annotator, Checkpoint, LabelSnapshot, Round
+from server.store.labels import snapshot_annotators, snapshot_page
+from server.store.tables import Annotator, Checkpoint, Round
 
 
 def get_checkpoint(session: Session, checkpoint_id: int) -> Checkpoint:
@@ -76,14 +76,24 @@ def lineage(session: Session, checkpoint_id: int) -> list[dict[str, Any]]:
     return chain
 
 
+def labels_behind(
+    session: Session, checkpoint_id: int, *, limit: int, cursor: int | None
+) -> tuple[Sequence[Row[int, int, int]], int | None]:
+    """A page of the labels that the checkpoint learned from: id, pair and annotator of each.
+
+    Raises NotFoundError. There are none behind a pretrained checkpoint.
+    """
+    digest = get_checkpoint(session, checkpoint_id).snapshot_digest
+    if digest is None:
+        return [], None
+    return snapshot_page(session, digest, limit=limit, cursor=cursor)
+
+
 def _origin(session: Session, checkpoint: Checkpoint) -> dict[str, Any]:
     made_by = None if checkpoint.round_id is None else session.get_one(Round, checkpoint.round_id)
-    label_ids: list[int] = []
     counts: Counter[int] = Counter()
     if checkpoint.snapshot_digest is not None:
-        label_ids = session.get_one(LabelSnapshot, checkpoint.snapshot_digest).label_ids
-        labels = snapshot_labels(session, checkpoint.snapshot_digest)
-        counts = Counter(label.annotator_id for label in labels)
+        counts = snapshot_annotators(session, checkpoint.snapshot_digest)
     names = {
         account.id: account.name
         for account in session.scalars(select(Annotator).where(Annotator.id.in_(counts)))
@@ -94,11 +104,11 @@ def _origin(session: Session, checkpoint: Checkpoint) -> dict[str, Any]:
         "config": None if made_by is None else made_by.config,
         "config_digest": None if made_by is None else config_digest(made_by.config),
         "snapshot_digest": checkpoint.snapshot_digest,
+        "labels": counts.total(),
         "labels_by_annotator": [
             {"annotator_id": key, "name": names[key], "labels": counts[key]}
             for key in sorted(counts)
         ],
-        "label_ids": label_ids,
         "code_version": checkpoint.code_version,
     }
 

@@ -18,7 +18,7 @@ def upgrade() -> None:
     op.create_index(
         "ix_label_of_campaign",
         "label",
-        ["campaign_id", "pair_id", "annotator_id", "choice", "retracted"],
+        ["campaign_id", "pair_id", "annotator_id", "choice", "retracted", "duration_ms"],
     )
     op.drop_index("ix_label_campaign_id", "label")
     op.create_index(

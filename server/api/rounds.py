@@ -11,12 +11,19 @@ from sqlalchemy.orm import Session
 
 from server import checkpoints, rounds
 from server.api.access import ReadSession, Staff, UseServices, WriteSession
-from server.api.params import Limit, PathId
+from server.api.params import Cursor, Limit, PathId
 from server.campaigns import get_campaign
 from server.errors import NotFoundError
 from server.rounds import RoundRequest
-from server.schemas.common import Id, ShortText
-from server.schemas.rounds import CheckpointOut, JobOut, LineageStep, RoundCreate, RoundOut
+from server.schemas.common import Id, Page, ShortText
+from server.schemas.rounds import (
+    CheckpointOut,
+    JobOut,
+    LabelBehind,
+    LineageStep,
+    RoundCreate,
+    RoundOut,
+)
 from server.states import JobState
 from server.store.tables import Checkpoint, Event, Job, LabelSnapshot, Round
 
@@ -143,6 +150,22 @@ def checkpoint_lineage(
     """The checkpoint and its parents, down to the labels behind each."""
     steps = checkpoints.lineage(session, checkpoint_id)
     return [LineageStep.model_validate(step) for step in steps]
+
+
+@router.get("/checkpoints/{checkpoint_id}/labels")
+def checkpoint_labels(
+    checkpoint_id: PathId,
+    _me: Staff,
+    session: ReadSession,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[LabelBehind]:
+    """The labels that the checkpoint learned from, oldest first."""
+    rows, next_cursor = checkpoints.labels_behind(
+        session, checkpoint_id, limit=limit, cursor=cursor
+    )
+    items = [LabelBehind.model_validate(row) for row in rows]
+    return Page[LabelBehind](items=items, next_cursor=next_cursor)
 
 
 @router.get("/jobs")

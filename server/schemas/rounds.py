@@ -111,6 +111,14 @@ class LabelsOfAnnotator(Out):
     labels: int
 
 
+class LabelBehind(Out):
+    """One label that a checkpoint learned from."""
+
+    id: int
+    pair_id: int
+    annotator_id: int
+
+
 class LineageStep(Out):
     """One checkpoint of the chain, with what made it."""
 
@@ -119,8 +127,8 @@ class LineageStep(Out):
     config: dict[str, Any] | None
     config_digest: str | None
     snapshot_digest: str | None
+    labels: int
     labels_by_annotator: list[LabelsOfAnnotator]
-    label_ids: list[int]
     code_version: str
 
 

@@ -254,6 +254,7 @@ class Label(Base):
             "annotator_id",
             "choice",
             "retracted",
+            "duration_ms",
         ),
         Index("ix_label_of_annotator", "annotator_id", "campaign_id", "pair_id", "retracted"),
     )

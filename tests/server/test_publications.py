@@ -131,12 +131,24 @@ def test_lineage_leads_from_the_policy_to_the_clicks(world: World, campaign_id: 
     assert newest["config"] == client.get(f"/rounds/{made_by.id}").json()["config"]
     assert len(newest["config_digest"]) == 64
     assert newest["snapshot_digest"] == made_by.snapshot_digest
-    assert newest["label_ids"] == [label.id, other.id]
+    assert newest["labels"] == 2
     assert newest["labels_by_annotator"] == [
         {"annotator_id": world.ids["ann"], "name": "ann", "labels": 1},
         {"annotator_id": world.ids["bob"], "name": "bob", "labels": 1},
     ]
-    assert (oldest["checkpoint"]["id"], oldest["label_ids"]) == (1, [])
+    assert (oldest["checkpoint"]["id"], oldest["labels"]) == (1, 0)
+    assert oldest["labels_by_annotator"] == []
+    clicks = [
+        {"id": label.id, "pair_id": 1, "annotator_id": world.ids["ann"]},
+        {"id": other.id, "pair_id": 2, "annotator_id": world.ids["bob"]},
+    ]
+    path = f"/checkpoints/{candidate.id}/labels"
+    assert client.get(path).json() == {"items": clicks, "next_cursor": None}
+    assert client.get(f"{path}?limit=1").json() == {"items": clicks[:1], "next_cursor": label.id}
+    rest = client.get(f"{path}?limit=1&cursor={label.id}").json()
+    assert rest == {"items": clicks[1:], "next_cursor": None}
+    assert client.get("/checkpoints/1/labels").json() == {"items": [], "next_cursor": None}
+    assert client.get("/checkpoints/77/labels").status_code == 404
     assert (oldest["config_digest"], oldest["code_version"]) == (None, "0.1.0")
     assert client.get(f"/rounds/{made_by.id}").json()["candidate_checkpoint_id"] == candidate.id
     assert client.get("/checkpoints?task=avoid").json()[0]["id"] == candidate.id

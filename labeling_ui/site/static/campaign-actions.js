@@ -100,7 +100,7 @@ export function campaignActions(id, data, refresh) {
 
   const cancel = (round) => confirmed(`Round ${round.id} is cancelled.`, {
     title: `Cancel round ${round.id}?`,
-    text: "The labels stay; a round can be started from them again.",
+    text: "The labels stay, and count as new again.",
     confirm: "Cancel round",
     danger: true,
     onSubmit: () => post(`/rounds/${round.id}/cancel`),

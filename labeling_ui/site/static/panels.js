@@ -168,7 +168,7 @@ export function lineageList(steps) {
   return element(
     "ol.lineage", {},
     steps.map((step) => {
-      const people = step.labels_by_annotator.map((item) => `${item.name} ${item.labels}`).join(", ");
+      const people = step.labels_by_annotator.map((item) => `${item.name} ${count(item.labels)}`).join(", ");
       const method = step.config?.method;
       return element(
         "li", {},
@@ -177,7 +177,7 @@ export function lineageList(steps) {
           ? element("p.muted.small", {}, "pretrained, no labels behind it")
           : element("p.muted.small", {}, `Round ${step.round_id}, ${method}, configuration ${short(step.config_digest)}`),
         step.round_id === null ? null
-          : element("p.muted.small", {}, `${step.label_ids.length} labels (snapshot ${short(step.snapshot_digest)}): ${people}`),
+          : element("p.muted.small", {}, `${count(step.labels)} labels (snapshot ${short(step.snapshot_digest)}): ${people}`),
         element("p.muted.small", {}, `code version ${step.code_version}`),
       );
     }),
