@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from server.checkpoints import pretrained_by_task, task_facts
 from server.errors import ConflictError, NotFoundError
-from server.publications import record_start
+from server.publications import record_start, rollback_target
 from server.rounds import EVALUATION_SEED
 from server.snapshots import new_labels_since_round
 from server.states import DECISIVE, Choice, JobKind, JobState, PairState
@@ -228,6 +228,7 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
         "labels": _label_counts(session, campaign_id, answers),
         "annotators": _annotator_counts(session, campaign_id, answers),
         "jobs": _job_counts(session, campaign_id),
+        "rollback_checkpoint_id": rollback_target(session, campaign_id),
     }
 
 

@@ -12,6 +12,7 @@ from sqlalchemy import Row, select
 from sqlalchemy.orm import Session
 
 from server.errors import NotFoundError
+from server.states import PublishRule
 from server.store.labels import snapshot_annotators, snapshot_page
 from server.store.tables import Annotator, Checkpoint, Round
 
@@ -24,12 +25,12 @@ def get_checkpoint(session: Session, checkpoint_id: int) -> Checkpoint:
     return checkpoint
 
 
-def list_checkpoints(session: Session, *, task: str | None) -> Sequence[Checkpoint]:
-    """Checkpoints of one task or of all, newest first."""
-    query = select(Checkpoint).order_by(Checkpoint.id.desc())
-    if task is not None:
-        query = query.where(Checkpoint.task == task)
-    return session.scalars(query).all()
+def from_comparison_rounds(session: Session, rows: Sequence[Checkpoint]) -> set[int]:
+    """Ids of those that come from a comparison round, of whichever campaign: never published."""
+    rounds = {row.round_id for row in rows} - {None}
+    query = select(Round.id).where(Round.id.in_(rounds), Round.publish_rule == PublishRule.NEVER)
+    compared = set(session.scalars(query))
+    return {row.id for row in rows if row.round_id in compared}
 
 
 def task_facts(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class RoundCreate(In):
 
 
 class RoundOut(Out):
-    """A round; `labels` is the size of its snapshot."""
+    """A round; `labels` is the size of its snapshot. In lists `result` has no paths."""
 
     id: int
     campaign_id: int
@@ -97,6 +97,7 @@ class CheckpointOut(Out):
     parent_id: int | None
     round_id: int | None
     snapshot_digest: str | None
+    comparison: bool  # of a round that is never published
     config: dict[str, Any]
     metrics: dict[str, Any]
     code_version: str

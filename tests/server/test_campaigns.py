@@ -44,7 +44,7 @@ def test_a_campaign_takes_its_defaults_from_the_task(world: World, checkpoint_id
         "archived": False,
         "created_at": "2026-11-22T12:00:00Z",
     }
-    history = world.client("ada").get("/campaigns/1/publications").json()
+    history = world.client("ada").get("/campaigns/1/publications").json()["items"]
     assert [(row["action"], row["checkpoint_id"]) for row in history] == [("start", checkpoint_id)]
     (task,) = world.client("ann").get("/tasks").json()
     assert (task["name"], task["preferred_group"], task["checkpoints"]) == ("avoid", "left", 1)
@@ -220,8 +220,9 @@ def test_stats_count_what_is_in_force(world: World) -> None:
             },
         ],
         "jobs": {"queued": 0, "running": 0, "failed": 1},
+        "rollback_checkpoint_id": None,
     }
-    accounts = world.client("ada").get("/annotators").json()
+    accounts = world.client("ada").get("/annotators").json()["items"]
     assert {row["name"]: row["labels"] for row in accounts}["ann"] == 2
 
 

@@ -64,7 +64,7 @@ def test_a_launched_round_is_frozen_queued_and_can_be_followed(world: World) -> 
     assert job.dedupe_key == f"finetune:{found['id']}"
     assert world.sent == [(job.id, JobKind.FINETUNE)]
     assert world.client("ada").get(f"/rounds/{found['id']}").json() == found
-    assert world.client("ada").get(f"/campaigns/{campaign_id}/rounds").json() == [found]
+    assert world.client("ada").get(f"/campaigns/{campaign_id}/rounds").json()["items"] == [found]
 
 
 def test_a_snapshot_holds_the_last_word_of_each_annotator_on_each_pair(database: Database) -> None:
@@ -331,6 +331,23 @@ def test_curves_are_the_points_of_the_round_in_order(world: World) -> None:
     points = world.client("sam").get(f"/rounds/{round_id}/curves").json()
     assert [point["step"] for point in points] == [0, 1, 2]
     assert points[1] == {"stage": "score", "step": 1, "loss": 0.5}
+
+
+def test_rounds_are_listed_newest_first_without_what_their_evaluations_draw(world: World) -> None:
+    campaign_id = _labelled(world)
+    ids = [_launch(world, campaign_id, publish_rule="never").json()["id"] for _ in range(3)]
+    evaluation = {"success": 0.5, "n": 2, "paths": [[[0, 1]]], "path_groups": ["left"]}
+    result = {"before": evaluation, "after": evaluation, "gate": {"passed": True}, "seconds": {}}
+    with world.database.write() as session:
+        session.get_one(Round, ids[2]).result = result
+    client = world.client("sam")
+    first = client.get(f"/campaigns/{campaign_id}/rounds?limit=2").json()
+    assert [row["id"] for row in first["items"]] == [ids[2], ids[1]]
+    short = {"success": 0.5, "n": 2}
+    assert first["items"][0]["result"] == result | {"before": short, "after": short}
+    rest = client.get(f"/campaigns/{campaign_id}/rounds?cursor={first['next_cursor']}").json()
+    assert [row["id"] for row in rest["items"]] == [ids[0]] and rest["next_cursor"] is None
+    assert client.get(f"/rounds/{ids[2]}").json()["result"] == result
 
 
 def _add_labels(session: Any, campaign_id: int, pairs: slice) -> None:
