@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import datetime, timedelta
 
 from sqlalchemy import func, select, update
@@ -116,11 +115,6 @@ def _refuse_last_admin(session: Session, account: Annotator) -> None:
         raise ConflictError(f"account {account.name!r} is the last active admin")
 
 
-def list_annotators(session: Session) -> Sequence[Annotator]:
-    """All accounts, oldest first."""
-    return session.scalars(select(Annotator).order_by(Annotator.id)).all()
-
-
 def labels_per_annotator(session: Session) -> dict[int, int]:
     """Labels in force by annotator id."""
     query = select(Label.annotator_id, func.count()).where(is_effective())
@@ -155,14 +149,6 @@ def issue_token(
         details={"annotator_id": annotator_id, "name": name},
     )
     return token, text
-
-
-def list_tokens(session: Session, *, annotator_id: int | None) -> Sequence[ApiToken]:
-    """Tokens of one account or of all, newest first."""
-    query = select(ApiToken).order_by(ApiToken.id.desc())
-    if annotator_id is not None:
-        query = query.where(ApiToken.annotator_id == annotator_id)
-    return session.scalars(query).all()
 
 
 def revoke_token(session: Session, now: datetime, token_id: int, *, me: Me) -> None:

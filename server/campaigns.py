@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -16,7 +16,7 @@ from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.spec import EVALUATION_SEED
 from server.checkpoints import pretrained_by_task, task_facts
 from server.errors import ConflictError, NotFoundError
-from server.publications import record_start
+from server.publications import record_start, rollback_target
 from server.snapshots import new_labels_since_round
 from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs
@@ -211,6 +211,7 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
     """Figures of the campaign, as `StatsOut` shows them; raises NotFoundError."""
     get_campaign(session, campaign_id)
     pairs = count_by_state(session, campaign_id)
+    answers = _answers(session, campaign_id)
     episodes = select(func.count()).where(Episode.campaign_id == campaign_id)
     return {
         "episodes": session.scalar(episodes),
@@ -224,19 +225,41 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
                 )
             ),
         },
-        "labels": _label_counts(session, campaign_id),
-        "annotators": _annotator_counts(session, campaign_id),
+        "labels": _label_counts(session, campaign_id, answers),
+        "annotators": _annotator_counts(session, campaign_id, answers),
         "jobs": _job_counts(session, campaign_id),
+        "rollback_checkpoint_id": rollback_target(session, campaign_id),
     }
 
 
-def _label_counts(session: Session, campaign_id: int) -> dict[str, Any]:
-    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign_id))
-    query = select(Label.choice, func.count()).where(
-        Label.campaign_id == campaign_id, is_effective()
+@dataclass(frozen=True)
+class _Answers:
+    """How many labels in force one annotator gave, of one choice, on pairs shown one way round."""
+
+    annotator_id: int
+    choice: str
+    first_is_left: bool
+    count: int
+
+
+def _answers(session: Session, campaign_id: int) -> list[_Answers]:
+    """All labels in force, counted: some rows for each annotator."""
+    keys = (Label.annotator_id, Label.choice, Pair.first_is_left)
+    query = (
+        select(*keys, func.count())
+        .join(Pair, Pair.id == Label.pair_id)
+        .where(Label.campaign_id == campaign_id, is_effective())
+        .group_by(*keys)
     )
-    found = dict(session.execute(query.group_by(Label.choice)).all())
-    by_choice = {choice.value: found.get(choice.value, 0) for choice in Choice}
+    return [_Answers(*row) for row in session.execute(query)]
+
+
+def _label_counts(session: Session, campaign_id: int, answers: list[_Answers]) -> dict[str, Any]:
+    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign_id))
+    found: Counter[str] = Counter()
+    for answer in answers:
+        found[answer.choice] += answer.count
+    by_choice = {choice.value: found[choice.value] for choice in Choice}
     return {
         "total": total,
         "effective": sum(by_choice.values()),
@@ -245,20 +268,18 @@ def _label_counts(session: Session, campaign_id: int) -> dict[str, Any]:
     }
 
 
-def _annotator_counts(session: Session, campaign_id: int) -> list[dict[str, Any]]:
-    rows = session.execute(
-        select(Label.annotator_id, Label.choice, Label.duration_ms, Pair.first_is_left)
-        .join(Pair, Pair.id == Label.pair_id)
-        .where(Label.campaign_id == campaign_id, is_effective())
-    ).all()
-    labels = Counter(row.annotator_id for row in rows)
-    durations: dict[int, list[int]] = defaultdict(list)
-    sides: dict[int, list[bool]] = defaultdict(list)
-    for row in rows:
-        if row.duration_ms is not None:
-            durations[row.annotator_id].append(row.duration_ms)
-        if row.choice in DECISIVE:
-            sides[row.annotator_id].append((row.choice == Choice.FIRST) == row.first_is_left)
+def _annotator_counts(
+    session: Session, campaign_id: int, answers: list[_Answers]
+) -> list[dict[str, Any]]:
+    labels: Counter[int] = Counter()
+    left: Counter[int] = Counter()
+    right: Counter[int] = Counter()
+    for answer in answers:
+        labels[answer.annotator_id] += answer.count
+        if answer.choice in DECISIVE:
+            is_left = (answer.choice == Choice.FIRST) == answer.first_is_left
+            (left if is_left else right)[answer.annotator_id] += answer.count
+    medians = _median_durations(session, campaign_id)
     accounts = session.scalars(select(Annotator).where(Annotator.id.in_(labels)))
     return [
         {
@@ -266,19 +287,35 @@ def _annotator_counts(session: Session, campaign_id: int) -> list[dict[str, Any]
             "name": account.name,
             "kind": account.kind,
             "labels": labels[account.id],
-            "median_duration_ms": _median(durations[account.id]),
-            "left_share": _share(sides[account.id]),
+            "median_duration_ms": medians.get(account.id),
+            "left_share": _share(left[account.id], right[account.id]),
         }
         for account in sorted(accounts, key=lambda account: account.id)
     ]
 
 
-def _median(values: list[int]) -> float | None:
-    return float(statistics.median(values)) if values else None
+def _median_durations(session: Session, campaign_id: int) -> dict[int, float]:
+    """By annotator the median in milliseconds of the labels in force that have a duration."""
+    own, duration = Label.annotator_id, Label.duration_ms
+    ranked = (
+        select(
+            own,
+            duration,
+            func.row_number().over(partition_by=own, order_by=duration).label("rank"),
+            func.count().over(partition_by=own).label("count"),
+        )
+        .where(Label.campaign_id == campaign_id, duration.is_not(None), is_effective())
+        .subquery()
+    )
+    # The one in the middle, or the two: twice the rank is count + 1, or count and count + 2.
+    middle = (2 * ranked.c.rank).between(ranked.c["count"], ranked.c["count"] + 2)
+    query = select(ranked.c.annotator_id, func.avg(ranked.c.duration_ms)).where(middle)
+    found = session.execute(query.group_by(ranked.c.annotator_id))
+    return {annotator_id: float(median) for annotator_id, median in found}
 
 
-def _share(flags: list[bool]) -> float | None:
-    return sum(flags) / len(flags) if flags else None
+def _share(one: int, other: int) -> float | None:
+    return one / (one + other) if one + other else None
 
 
 def _job_counts(session: Session, campaign_id: int) -> dict[str, int]:

@@ -8,12 +8,13 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Row, select
 from sqlalchemy.orm import Session
 
 from server.errors import NotFoundError
-from server.store.labels import snapshot_labels
-from server.store.tables import Annotator, Checkpoint, LabelSnapshot, Round
+from server.states import PublishRule
+from server.store.labels import snapshot_annotators, snapshot_page
+from server.store.tables import Annotator, Checkpoint, Round
 
 
 def get_checkpoint(session: Session, checkpoint_id: int) -> Checkpoint:
@@ -24,12 +25,12 @@ def get_checkpoint(session: Session, checkpoint_id: int) -> Checkpoint:
     return checkpoint
 
 
-def list_checkpoints(session: Session, *, task: str | None) -> Sequence[Checkpoint]:
-    """Checkpoints of one task or of all, newest first."""
-    query = select(Checkpoint).order_by(Checkpoint.id.desc())
-    if task is not None:
-        query = query.where(Checkpoint.task == task)
-    return session.scalars(query).all()
+def from_comparison_rounds(session: Session, rows: Sequence[Checkpoint]) -> set[int]:
+    """Ids of those that come from a comparison round, of whichever campaign: never published."""
+    rounds = {row.round_id for row in rows} - {None}
+    query = select(Round.id).where(Round.id.in_(rounds), Round.publish_rule == PublishRule.NEVER)
+    compared = set(session.scalars(query))
+    return {row.id for row in rows if row.round_id in compared}
 
 
 def task_facts(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -76,14 +77,24 @@ def lineage(session: Session, checkpoint_id: int) -> list[dict[str, Any]]:
     return chain
 
 
+def labels_behind(
+    session: Session, checkpoint_id: int, *, limit: int, cursor: int | None
+) -> tuple[Sequence[Row[int, int, int]], int | None]:
+    """A page of the labels that the checkpoint learned from: id, pair and annotator of each.
+
+    Raises NotFoundError. There are none behind a pretrained checkpoint.
+    """
+    digest = get_checkpoint(session, checkpoint_id).snapshot_digest
+    if digest is None:
+        return [], None
+    return snapshot_page(session, digest, limit=limit, cursor=cursor)
+
+
 def _origin(session: Session, checkpoint: Checkpoint) -> dict[str, Any]:
     made_by = None if checkpoint.round_id is None else session.get_one(Round, checkpoint.round_id)
-    label_ids: list[int] = []
     counts: Counter[int] = Counter()
     if checkpoint.snapshot_digest is not None:
-        label_ids = session.get_one(LabelSnapshot, checkpoint.snapshot_digest).label_ids
-        labels = snapshot_labels(session, checkpoint.snapshot_digest)
-        counts = Counter(label.annotator_id for label in labels)
+        counts = snapshot_annotators(session, checkpoint.snapshot_digest)
     names = {
         account.id: account.name
         for account in session.scalars(select(Annotator).where(Annotator.id.in_(counts)))
@@ -94,11 +105,11 @@ def _origin(session: Session, checkpoint: Checkpoint) -> dict[str, Any]:
         "config": None if made_by is None else made_by.config,
         "config_digest": None if made_by is None else config_digest(made_by.config),
         "snapshot_digest": checkpoint.snapshot_digest,
+        "labels": counts.total(),
         "labels_by_annotator": [
             {"annotator_id": key, "name": names[key], "labels": counts[key]}
             for key in sorted(counts)
         ],
-        "label_ids": label_ids,
         "code_version": checkpoint.code_version,
     }
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 
-from sqlalchemy import func, select
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from server.errors import NotFoundError
@@ -15,9 +16,11 @@ from server.store.labels import is_effective
 from server.store.pairs import (
     count_by_state,
     count_taken,
+    has_labelled,
     live_leases,
     open_pairs,
 )
+from server.store.session import LOCK
 from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pair
 
 MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetching
@@ -25,6 +28,7 @@ MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetchin
 # "equal" teaches less. Every so many of an annotator's pairs comes in turn all the same: what
 # the first labels took for alike is looked at again.
 IN_TURN = 5
+LOOK_AHEAD = 20  # more annotators than ask in the same moment: each finds the one before at work
 
 
 class NothingReason(StrEnum):
@@ -37,14 +41,53 @@ class NothingReason(StrEnum):
 
 @dataclass(frozen=True)
 class Handout:
-    """A leased pair, and how far the annotator is. Nothing of policies, modes or other labels."""
+    """A leased pair. Nothing of policies, modes or other labels."""
 
     lease: Lease
     pair: Pair
     criterion: str
     duration_s: float | None  # of the longer episode
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an annotator is in a campaign."""
+
     done: int
     remaining: int  # including the pairs that the annotator holds
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What an annotator would get next, as seen before the pair is locked.
+
+    Looking for it takes long in a large campaign, and needs no lock. What has changed since is
+    noticed when the pair is handed out.
+    """
+
+    handed_out: int  # leases that the annotator ever had
+    pairs: tuple[tuple[int, int], ...]  # id, and how often it was taken, in the order of hand-out
+
+
+def look_ahead(
+    session: Session,
+    now: datetime,
+    campaign_id: int,
+    annotator_id: int,
+    *,
+    hold: int = 1,
+    prefetch_after: int | None = None,
+) -> Outlook | None:
+    """What `next_pair` would lease; None when it would not look for a pair at all."""
+    campaign = session.get(Campaign, campaign_id)
+    if campaign is None or campaign.archived:
+        return None
+    held = live_leases(session, now, campaign_id, annotator_id)
+    if _held_suffices(held, hold, prefetch_after):
+        return None
+    handed_out = _handed_out(session, annotator_id)
+    found = session.execute(_open_for(now, campaign, annotator_id, handed_out).limit(LOOK_AHEAD))
+    return Outlook(handed_out, tuple((pair.id, taken) for pair, taken in found))
 
 
 def next_pair(
@@ -56,12 +99,14 @@ def next_pair(
     lease_for: timedelta,
     hold: int = 1,
     prefetch_after: int | None = None,
+    outlook: Outlook | None = None,
 ) -> Handout | NothingReason:
     """The pair to label next, under a lease.
 
     What the annotator holds already comes first (a reloaded page gets its pair back). While fewer
     than `hold` pairs are held a new one is leased; with `prefetch_after` the answer is never that
-    pair. Raises NotFoundError.
+    pair. With the `outlook` of `look_ahead` the pair is mostly found without a search. Raises
+    NotFoundError.
     """
     campaign = session.get(Campaign, campaign_id)
     if campaign is None:
@@ -71,15 +116,23 @@ def next_pair(
     _one_request_at_a_time(session, campaign_id, annotator_id)
     held = list(live_leases(session, now, campaign_id, annotator_id))
     others = [lease for lease in held if lease.pair_id != prefetch_after]
-    if others and (prefetch_after is not None or len(held) >= min(hold, MAX_HOLD)):
-        return handout(session, now, campaign, _prolong(others[0], now, lease_for))
-    pair = _take_open_pair(session, now, campaign, annotator_id)
+    if _held_suffices(held, hold, prefetch_after):
+        return handout(session, campaign, _prolong(others[0], now, lease_for))
+    pair = _take_foreseen_pair(session, now, annotator_id, outlook)
+    pair = pair or _take_open_pair(session, now, campaign, annotator_id)
     if pair is not None:
         lease = issue_lease(session, now, pair.id, annotator_id, lease_for=lease_for)
-        return handout(session, now, campaign, lease)
+        return handout(session, campaign, lease)
     if others:
-        return handout(session, now, campaign, _prolong(others[0], now, lease_for))
+        return handout(session, campaign, _prolong(others[0], now, lease_for))
     return _why_nothing(session, campaign_id)
+
+
+def _held_suffices(held: Sequence[Lease], hold: int, prefetch_after: int | None) -> bool:
+    """Whether a pair that the annotator holds is the answer, and no new one is wanted."""
+    if all(lease.pair_id == prefetch_after for lease in held):
+        return False
+    return prefetch_after is not None or len(held) >= min(hold, MAX_HOLD)
 
 
 def _one_request_at_a_time(session: Session, campaign_id: int, annotator_id: int) -> None:
@@ -93,6 +146,24 @@ def _prolong(lease: Lease, now: datetime, lease_for: timedelta) -> Lease:
     return lease
 
 
+def _take_foreseen_pair(
+    session: Session, now: datetime, annotator_id: int, outlook: Outlook | None
+) -> Pair | None:
+    """Lock the first pair of the outlook that is still what it was; None when none is."""
+    if outlook is None or outlook.handed_out != _handed_out(session, annotator_id):
+        return None
+    for pair_id, taken in outlook.pairs:
+        pair: Pair | None = session.get(
+            Pair, pair_id, with_for_update=LOCK | {"skip_locked": True}, populate_existing=True
+        )
+        if pair is None or pair.state != PairState.READY:
+            continue
+        unchanged = taken == count_taken(session, now, pair_id, annotator_id)
+        if unchanged and not has_labelled(session, pair_id, annotator_id):
+            return pair
+    return None
+
+
 def _take_open_pair(
     session: Session, now: datetime, campaign: Campaign, annotator_id: int
 ) -> Pair | None:
@@ -103,19 +174,17 @@ def _take_open_pair(
     nothing else is left.
     """
     wanted = int(campaign.settings["labels_per_pair"])
-    telling_first = _handed_out(session, annotator_id) % IN_TURN != 0
+    handed_out = _handed_out(session, annotator_id)
     refused: list[int] = []
     skip_locked = True
     while True:
         query = (
-            open_pairs(
-                now, campaign.id, annotator_id, labels_per_pair=wanted, telling_first=telling_first
-            )
+            _open_for(now, campaign, annotator_id, handed_out)
             .where(Pair.id.not_in(refused))
             .limit(1)
             .with_for_update(of=Pair, key_share=True, skip_locked=skip_locked)
         )
-        pair = session.scalars(query).one_or_none()
+        pair: Pair | None = session.scalars(query).one_or_none()
         if pair is None and not skip_locked:
             return None
         if pair is None:
@@ -124,6 +193,22 @@ def _take_open_pair(
             return pair
         else:
             refused.append(pair.id)
+
+
+def _open_for(
+    now: datetime, campaign: Campaign, annotator_id: int, handed_out: int | None = None
+) -> Select[Pair, int]:
+    """The pairs that the annotator can get, in the order of hand-out.
+
+    `handed_out`: how many leases the annotator ever had; None when the order does not matter.
+    """
+    return open_pairs(
+        now,
+        campaign.id,
+        annotator_id,
+        labels_per_pair=int(campaign.settings["labels_per_pair"]),
+        telling_first=handed_out is not None and handed_out % IN_TURN != 0,
+    )
 
 
 def _handed_out(session: Session, annotator_id: int) -> int:
@@ -143,33 +228,23 @@ def issue_lease(
     return lease
 
 
-def handout(session: Session, now: datetime, campaign: Campaign, lease: Lease) -> Handout:
+def handout(session: Session, campaign: Campaign, lease: Lease) -> Handout:
     """The lease with what its page shows."""
     session.flush()
     pair = session.get_one(Pair, lease.pair_id)
+    return Handout(lease, pair, campaign.criterion, _duration(session, pair))
+
+
+def progress(session: Session, now: datetime, campaign_id: int, annotator_id: int) -> Progress:
+    """How far the annotator is. It counts the whole campaign: not for a writer's session."""
+    campaign = session.get_one(Campaign, campaign_id)
     mine = select(func.count()).where(
-        Label.campaign_id == campaign.id,
-        Label.annotator_id == lease.annotator_id,
-        is_effective(),
+        Label.campaign_id == campaign_id, Label.annotator_id == annotator_id, is_effective()
     )
-    still_open = open_pairs(
-        now,
-        campaign.id,
-        lease.annotator_id,
-        labels_per_pair=int(campaign.settings["labels_per_pair"]),
-    )
-    counted = session.execute(
-        select(func.count()).select_from(still_open.order_by(None).subquery())
-    ).scalar_one()
-    held = len(live_leases(session, now, campaign.id, lease.annotator_id))
-    return Handout(
-        lease=lease,
-        pair=pair,
-        criterion=campaign.criterion,
-        duration_s=_duration(session, pair),
-        done=session.execute(mine).scalar_one(),
-        remaining=counted + held,
-    )
+    still_open = _open_for(now, campaign, annotator_id).with_only_columns(Pair.id).order_by(None)
+    counted = session.execute(select(func.count()).select_from(still_open.subquery())).scalar_one()
+    held = len(live_leases(session, now, campaign_id, annotator_id))
+    return Progress(done=session.execute(mine).scalar_one(), remaining=counted + held)
 
 
 def _duration(session: Session, pair: Pair) -> float | None:

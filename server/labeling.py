@@ -145,7 +145,7 @@ def undo_label(
         if created:
             _tell(session, now, retraction)
     return retraction, handout(
-        session, now, campaign, _live_or_new_lease(session, now, pair.id, me.id, lease_for)
+        session, campaign, _live_or_new_lease(session, now, pair.id, me.id, lease_for)
     )
 
 

@@ -55,6 +55,16 @@ def rollback(
 ) -> Publication:
     """Move the alias back to what was published before; raises ConflictError at the start."""
     campaign = _locked_campaign(session, campaign_id)
+    before = rollback_target(session, campaign_id)
+    if before is None:
+        raise ConflictError(
+            f"campaign {campaign_id} is at its starting checkpoint; there is nothing to roll back"
+        )
+    return _move(session, now, campaign, before, action="rollback", reason=reason, by=by)
+
+
+def rollback_target(session: Session, campaign_id: int) -> int | None:
+    """The checkpoint that a rollback would publish again; None when there is nothing before."""
     history = session.scalars(
         select(Publication).where(Publication.campaign_id == campaign_id).order_by(Publication.id)
     )
@@ -64,11 +74,7 @@ def rollback(
             stack.pop()
         else:
             stack.append(row.checkpoint_id)
-    if len(stack) < 2:
-        raise ConflictError(
-            f"campaign {campaign_id} is at its starting checkpoint; there is nothing to roll back"
-        )
-    return _move(session, now, campaign, stack[-2], action="rollback", reason=reason, by=by)
+    return stack[-2] if len(stack) > 1 else None
 
 
 def record_start(session: Session, now: datetime, campaign: Campaign, *, by: int | None) -> None:

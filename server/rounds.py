@@ -6,6 +6,7 @@ any state before the last three → failed | cancelled; a failed one can be take
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
@@ -26,6 +27,7 @@ from server.states import (
 )
 from server.store import jobs
 from server.store.events import add_event, audit
+from server.store.labels import has_decisive_label
 from server.store.session import LOCK
 from server.store.tables import Campaign, Job, Pair, Round
 
@@ -51,6 +53,9 @@ _STATE_OF_RETRIED: dict[JobKind, RoundState] = {
     JobKind.EVALUATE: RoundState.EVALUATING,
     JobKind.PUBLISH: RoundState.GATING,
 }
+# No round starts by itself so soon after one that failed or was cancelled; twice as long after the
+# second in a row, and so on. Time to look what was wrong, or to change the settings.
+RETRY_AFTER = timedelta(minutes=10)
 
 
 @dataclass(frozen=True)
@@ -248,6 +253,8 @@ def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger 
         return None
     if session.scalars(_publishing(campaign.id).limit(1)).first() is not None:
         return None
+    if now < _rest_ends(session, campaign) or not has_decisive_label(session, campaign.id):
+        return None
     new_labels = new_labels_since_round(session, campaign.id)
     if every_labels > 0 and new_labels >= every_labels:
         return RoundTrigger.LABELS
@@ -262,19 +269,32 @@ def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger 
     return None
 
 
+def _rest_ends(session: Session, campaign: Campaign) -> datetime:
+    """When rounds may start by themselves again after those that failed or were cancelled."""
+    ended = session.execute(
+        select(Round.state, Round.finished_at)
+        .where(Round.campaign_id == campaign.id, Round.publish_rule != PublishRule.NEVER)
+        .order_by(Round.id.desc())
+        .limit(20)  # after so many in a row the rest is longer than anybody waits
+    ).all()
+    in_vain = list(itertools.takewhile(lambda row: row.state in _ENDINGS, ended))
+    if not in_vain:
+        return campaign.created_at
+    last: datetime = in_vain[0].finished_at
+    rest: timedelta = RETRY_AFTER * 2 ** (len(in_vain) - 1)
+    return last + rest
+
+
 def launch_due(session: Session, now: datetime, campaign_id: int) -> Round | None:
     """Start the round that is due, if one is; two ticks at once start one round."""
     campaign = _locked(session, campaign_id)
     trigger = is_due(session, now, campaign)
     if trigger is None:
         return None
-    try:
-        return launch(session, now, campaign_id, RoundRequest(), trigger=trigger)
-    except ConflictError:  # the new labels are all "equal" or "cannot tell"
-        return None
+    return launch(session, now, campaign_id, RoundRequest(), trigger=trigger)
 
 
-def active_campaign_ids(session: Session) -> list[int]:
-    """Campaigns that the tick looks at."""
-    query = select(Campaign.id).where(Campaign.archived.is_(False)).order_by(Campaign.id)
-    return list(session.scalars(query))
+def due_campaign_ids(session: Session, now: datetime) -> list[int]:
+    """Campaigns that `launch_due` would start a round of."""
+    query = select(Campaign).where(Campaign.archived.is_(False)).order_by(Campaign.id)
+    return [row.id for row in session.scalars(query) if is_due(session, now, row) is not None]

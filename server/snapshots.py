@@ -7,12 +7,17 @@ import json
 from collections.abc import Sequence
 from datetime import datetime
 
-from sqlalchemy import select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from server.errors import ConflictError, NotFoundError
-from server.states import DECISIVE, PublishRule
-from server.store.labels import effective_label_ids, snapshot_labels
+from server.states import PublishRule, RoundState
+from server.store.labels import (
+    count_effective,
+    effective_label_ids,
+    has_decisive_label,
+    snapshot_is_decisive,
+)
 from server.store.tables import LabelSnapshot, Round
 
 
@@ -51,30 +56,51 @@ def snapshot_to_learn_from(
     it says which episode is better.
     """
     if digest is None:
-        snapshot = freeze_snapshot(session, now, campaign_id)
-    else:
-        found = session.get(LabelSnapshot, digest)
-        if found is None or found.campaign_id != campaign_id:
-            raise NotFoundError(f"label snapshot of campaign {campaign_id}", digest)
-        snapshot = found
-    if not any(row.choice in DECISIVE for row in snapshot_labels(session, snapshot.digest)):
-        raise ConflictError(
-            f"campaign {campaign_id} has {snapshot.size} labels in force, but none says which"
-            " episode is better; collect labels first"
-        )
+        if not has_decisive_label(session, campaign_id):
+            raise _undecided(campaign_id, count_effective(session, campaign_id))
+        return freeze_snapshot(session, now, campaign_id)
+    snapshot = session.get(LabelSnapshot, digest)
+    if snapshot is None or snapshot.campaign_id != campaign_id:
+        raise NotFoundError(f"label snapshot of campaign {campaign_id}", digest)
+    if not snapshot_is_decisive(session, digest):
+        raise _undecided(campaign_id, snapshot.size)
     return snapshot
 
 
-def new_labels_since_round(session: Session, campaign_id: int) -> int:
-    """Labels in force that no earlier publishing round has learned from."""
-    used: set[int] = set()
-    snapshots = (
-        select(LabelSnapshot.label_ids)
-        .join(Round, Round.snapshot_digest == LabelSnapshot.digest)
-        .where(Round.campaign_id == campaign_id, Round.publish_rule != PublishRule.NEVER)
-        .order_by(Round.id.desc())
-        .limit(1)
+def _undecided(campaign_id: int, labels: int) -> ConflictError:
+    return ConflictError(
+        f"campaign {campaign_id} has {labels} labels in force, but none says which"
+        " episode is better; collect labels first"
     )
-    for label_ids in session.scalars(snapshots):
-        used.update(label_ids)
+
+
+def new_labels_since_round(session: Session, campaign_id: int) -> int:
+    """Labels in force that no publishing round has learned from.
+
+    What a round learned is lost when it fails or is cancelled: its labels are new again.
+    """
+    digest = _newest_learned(session, campaign_id)
+    if digest is None:
+        return count_effective(session, campaign_id)
+    used = set(session.get_one(LabelSnapshot, digest).label_ids)
     return sum(label_id not in used for label_id in effective_label_ids(session, campaign_id))
+
+
+def _newest_learned(session: Session, campaign_id: int) -> str | None:
+    """Of the snapshots that publishing rounds learned from, the one that was frozen last.
+
+    A label that is in force now was in force ever since it was given. So this one holds all labels
+    in force that the earlier ones hold, and no other need be read. The first round of a snapshot
+    froze it, so the rounds' ids tell which is the last.
+    """
+    learned = (Round.publish_rule != PublishRule.NEVER) & Round.state.not_in(
+        (RoundState.FAILED, RoundState.CANCELLED)
+    )
+    query = (
+        select(Round.snapshot_digest)
+        .where(Round.campaign_id == campaign_id)
+        .group_by(Round.snapshot_digest)
+        .having(func.sum(case((learned, 1), else_=0)) > 0)
+        .order_by(func.min(Round.id).desc())
+    )
+    return session.scalars(query.limit(1)).first()

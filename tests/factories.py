@@ -179,6 +179,7 @@ def add_label(
     key: str | None = None,
     supersedes_id: int | None = None,
     retracted: bool = False,
+    duration_ms: int | None = 1500,
 ) -> Label:
     """A label row, past the rules of the hand-out."""
     first = session.get_one(Episode, pair.first_episode_id)
@@ -203,7 +204,7 @@ def add_label(
         request_sha256="f" * 64,
         created_at=NOW,
         client_time=None,
-        duration_ms=1500,
+        duration_ms=duration_ms,
         active_ms=1200,
         replay_events=[],
         ui_version="test",

@@ -81,10 +81,11 @@ def resend(bench: Workbench, busy: Collection[str] = ()) -> None:
 
 def start_due_rounds(bench: Workbench) -> list[int]:
     """Ids of the started rounds; idempotent, because a started round is no longer due."""
+    # Whether a round is due takes counting: only for those that are does a writer's turn come.
     with bench.database.read() as session:
-        campaign_ids = rounds.active_campaign_ids(session)
+        due = rounds.due_campaign_ids(session, bench.clock())
     started = []
-    for campaign_id in campaign_ids:
+    for campaign_id in due:
         with bench.database.write() as session:
             new = rounds.launch_due(session, bench.clock(), campaign_id)
             if new is not None:

@@ -6,11 +6,12 @@ from datetime import timedelta
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response, status
+from sqlalchemy import select
 
 from rodif_core.errors import ValueOutOfRangeError
 from server import accounts, sign_in
 from server.api.access import COOKIE, Admin, Anyone, ReadSession, UseServices, WriteSession
-from server.api.params import PathId
+from server.api.params import Cursor, Limit, PathId
 from server.api.services import Services
 from server.errors import NotAllowedError
 from server.passwords import hash_password
@@ -25,9 +26,11 @@ from server.schemas.accounts import (
     TokenIssued,
     TokenOut,
 )
+from server.schemas.common import Page
 from server.sign_in import Me
 from server.states import Role
-from server.store.tables import Annotator
+from server.store.paging import page
+from server.store.tables import Annotator, ApiToken
 
 router = APIRouter(tags=["accounts"])
 
@@ -90,10 +93,14 @@ def _out(account: Annotator, labels: int) -> AnnotatorOut:
 
 
 @router.get("/annotators")
-def list_annotators(_me: Admin, session: ReadSession) -> list[AnnotatorOut]:
-    """All accounts."""
+def list_annotators(
+    _me: Admin, session: ReadSession, limit: Limit = 100, cursor: Cursor = None
+) -> Page[AnnotatorOut]:
+    """All accounts, oldest first."""
     labels = accounts.labels_per_annotator(session)
-    return [_out(row, labels.get(row.id, 0)) for row in accounts.list_annotators(session)]
+    rows, next_cursor = page(session, select(Annotator), Annotator.id, limit=limit, cursor=cursor)
+    items = [_out(row, labels.get(row.id, 0)) for row in rows]
+    return Page[AnnotatorOut](items=items, next_cursor=next_cursor)
 
 
 @router.post("/annotators", status_code=status.HTTP_201_CREATED)
@@ -145,11 +152,18 @@ def list_tokens(
     me: Anyone,
     session: ReadSession,
     mine: Annotated[bool, Query(description="only the own tokens")] = False,
-) -> list[TokenOut]:
-    """Own tokens; all of them for admins without `mine`."""
-    everything = me.role == Role.ADMIN and not mine
-    rows = accounts.list_tokens(session, annotator_id=None if everything else me.id)
-    return [TokenOut.model_validate(row) for row in rows]
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[TokenOut]:
+    """Own tokens, newest first; all of them for admins without `mine`."""
+    query = select(ApiToken)
+    if mine or me.role != Role.ADMIN:
+        query = query.where(ApiToken.annotator_id == me.id)
+    rows, next_cursor = page(
+        session, query, ApiToken.id, limit=limit, cursor=cursor, newest_first=True
+    )
+    items = [TokenOut.model_validate(row) for row in rows]
+    return Page[TokenOut](items=items, next_cursor=next_cursor)
 
 
 @router.post("/tokens", status_code=status.HTTP_201_CREATED)

@@ -180,13 +180,20 @@ def rollback(
 
 @router.get("/campaigns/{campaign_id}/publications")
 def list_publications(
-    campaign_id: PathId, _me: Admin, session: ReadSession
-) -> list[PublicationOut]:
+    campaign_id: PathId,
+    _me: Admin,
+    session: ReadSession,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[PublicationOut]:
     """All moves of the published alias, newest first."""
     campaigns.get_campaign(session, campaign_id)
     query = select(Publication).where(Publication.campaign_id == campaign_id)
-    rows = session.scalars(query.order_by(Publication.id.desc()))
-    return [PublicationOut.model_validate(row) for row in rows]
+    rows, next_cursor = page(
+        session, query, Publication.id, limit=limit, cursor=cursor, newest_first=True
+    )
+    items = [PublicationOut.model_validate(row) for row in rows]
+    return Page[PublicationOut](items=items, next_cursor=next_cursor)
 
 
 @router.get("/audit")

@@ -6,18 +6,19 @@ import asyncio
 import json
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from fastapi import APIRouter, Request
 from fastapi.responses import StreamingResponse
+from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from server.api.access import ReadSession, Staff, UseServices
-from server.api.params import LastEventId, PathId
+from server.api.params import EventsAfter, LastEventId, PathId
 from server.campaigns import get_campaign
 from server.errors import NotFoundError
 from server.rounds import FINAL_STATES
-from server.store.events import STREAM_NAMES, events_after
+from server.store.events import STREAM_NAMES, events_after, newest_event_id
 from server.store.tables import Event, Round
 
 router = APIRouter(tags=["events"])
@@ -41,11 +42,13 @@ def round_events(
     _me: Staff,
     session: ReadSession,
     services: UseServices,
-    last_event_id: LastEventId = 0,
+    after: EventsAfter = 0,
+    last_event_id: LastEventId = None,
 ) -> StreamingResponse:
     """progress | curve | state events of one round; ends after its final state."""
     if session.get(Round, round_id) is None:
         raise NotFoundError("round", round_id)
+    start = _start(session, after, last_event_id)
 
     def fetch(after: int) -> tuple[Sequence[Event], bool]:
         with services.database.read() as own:
@@ -53,7 +56,7 @@ def round_events(
             ended = own.get_one(Round, round_id).state in FINAL_STATES
             return events_after(own, after, round_id=round_id), ended
 
-    return _answer(request, fetch, last_event_id)
+    return _answer(request, fetch, start)
 
 
 @router.get("/campaigns/{campaign_id}/events", response_class=StreamingResponse, responses=_STREAM)
@@ -63,21 +66,30 @@ def campaign_events(
     _me: Staff,
     session: ReadSession,
     services: UseServices,
-    last_event_id: LastEventId = 0,
+    after: EventsAfter = 0,
+    last_event_id: LastEventId = None,
 ) -> StreamingResponse:
     """All events of a campaign: progress | curve | state | label | publication."""
     get_campaign(session, campaign_id)
+    start = _start(session, after, last_event_id)
 
     def fetch(after: int) -> tuple[Sequence[Event], bool]:
         with services.database.read() as own:
             return events_after(own, after, campaign_id=campaign_id), False
 
-    return _answer(request, fetch, last_event_id)
+    return _answer(request, fetch, start)
 
 
-def _answer(request: Request, fetch: Fetch, last_event_id: int) -> StreamingResponse:
+def _start(session: Session, after: int | Literal["now"], last_event_id: int | None) -> int:
+    """The id after which the stream begins: a browser that reconnects says what it has."""
+    if last_event_id is not None:
+        return last_event_id
+    return newest_event_id(session) if after == "now" else after
+
+
+def _answer(request: Request, fetch: Fetch, start: int) -> StreamingResponse:
     return StreamingResponse(
-        _stream(request, fetch, last_event_id),
+        _stream(request, fetch, start),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -89,7 +101,8 @@ async def _stream(request: Request, fetch: Fetch, last_id: int) -> AsyncIterator
     opened = spoken = clock()
     first_id = last_id
     sent: deque[int] = deque(maxlen=4 * LOOK_BACK)
-    yield "retry: 1000\n\n"
+    # The id lets a browser resume here, too, when the connection breaks before the first event.
+    yield f"retry: 1000\nid: {last_id}\n\n"
     while clock() - opened < MAX_STREAM_SECONDS and not await request.is_disconnected():
         events, ended = await run_in_threadpool(fetch, max(first_id, last_id - LOOK_BACK))
         fresh = [event for event in events if event.id not in sent]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from datetime import datetime
+
 from fastapi import APIRouter, Response, status
 from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
 from server import handout, labeling
 from server.api.access import (
@@ -51,7 +54,8 @@ def _thumbnail_url(pair: Pair) -> str | None:
     return f"/thumbnails/{pair.thumbnail_sha256}.webp" if pair.thumbnail_sha256 else None
 
 
-def _next_out(found: Handout) -> NextOut:
+def _next_out(session: Session, now: datetime, found: Handout) -> NextOut:
+    far = handout.progress(session, now, found.pair.campaign_id, found.lease.annotator_id)
     return NextOut(
         lease_id=found.lease.id,
         expires_at=found.lease.expires_at,
@@ -62,7 +66,7 @@ def _next_out(found: Handout) -> NextOut:
             duration_s=found.duration_s,
         ),
         criterion=found.criterion,
-        progress=Progress(done=found.done, remaining=found.remaining),
+        progress=Progress.model_validate(far),
     )
 
 
@@ -103,26 +107,31 @@ def _pair_out(pair: Pair) -> PairOut:
     },
 )
 def next_pair(
-    campaign_id: PathId,
-    me: Anyone,
-    session: WriteSession,
-    services: UseServices,
-    body: NextRequest | None = None,
+    campaign_id: PathId, me: Anyone, services: UseServices, body: NextRequest | None = None
 ) -> NextOut | Response:
     """The next pair to label, under a lease."""
-    request = body or NextRequest()
-    found = handout.next_pair(
-        session,
-        services.clock(),
-        campaign_id,
-        me.id,
-        lease_for=services.lease_for,
-        hold=request.hold,
-        prefetch_after=request.prefetch_after_pair_id,
-    )
+    request, now = body or NextRequest(), services.clock()
+    hold, prefetch_after = request.hold, request.prefetch_after_pair_id
+    # SQLite has one writer at a time: what takes long is done before it and after it.
+    with services.database.read() as session:
+        outlook = handout.look_ahead(
+            session, now, campaign_id, me.id, hold=hold, prefetch_after=prefetch_after
+        )
+    with services.database.write() as session:
+        found = handout.next_pair(
+            session,
+            now,
+            campaign_id,
+            me.id,
+            lease_for=services.lease_for,
+            hold=hold,
+            prefetch_after=prefetch_after,
+            outlook=outlook,
+        )
     if isinstance(found, NothingReason):
         return Response(status_code=status.HTTP_204_NO_CONTENT, headers={"X-Reason": found.value})
-    return _next_out(found)
+    with services.database.read() as session:
+        return _next_out(session, now, found)
 
 
 @router.post(
@@ -167,7 +176,7 @@ def undo_label(
         lease_for=services.lease_for,
     )
     shown = _label_out(label, first_is_left=again.pair.first_is_left)
-    return UndoOut(label=shown, next=_next_out(again))
+    return UndoOut(label=shown, next=_next_out(session, services.clock(), again))
 
 
 @router.get("/campaigns/{campaign_id}/labels")

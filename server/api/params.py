@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import Header, Path, Query
+from pydantic import Field
 
 from server.schemas.common import MAX_ID
 
@@ -23,4 +24,8 @@ IdempotencyKey = Annotated[
         description="made by the client for each answer, such as a UUID",
     ),
 ]
-LastEventId = Annotated[int, Header(alias="Last-Event-ID", ge=0, le=MAX_ID)]
+LastEventId = Annotated[int | None, Header(alias="Last-Event-ID", ge=0, le=MAX_ID)]
+EventsAfter = Annotated[
+    Annotated[int, Field(ge=0, le=MAX_ID)] | Literal["now"],
+    Query(description="events after this id, or from now on; Last-Event-ID has precedence"),
+]

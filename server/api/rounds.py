@@ -11,16 +11,38 @@ from sqlalchemy.orm import Session
 
 from server import checkpoints, rounds
 from server.api.access import ReadSession, Staff, UseServices, WriteSession
-from server.api.params import Limit, PathId
+from server.api.params import Cursor, Limit, PathId
 from server.campaigns import get_campaign
 from server.errors import NotFoundError
 from server.rounds import RoundRequest
-from server.schemas.common import Id, ShortText
-from server.schemas.rounds import CheckpointOut, JobOut, LineageStep, RoundCreate, RoundOut
+from server.schemas.common import Id, Page, ShortText
+from server.schemas.rounds import (
+    CheckpointOut,
+    JobOut,
+    LabelBehind,
+    LineageStep,
+    RoundCreate,
+    RoundOut,
+)
 from server.states import JobState
+from server.store.paging import page
 from server.store.tables import Checkpoint, Event, Job, LabelSnapshot, Round
 
 router = APIRouter(tags=["rounds"])
+
+
+# What an evaluation draws, some 100 kB a round: only in the answer for one round.
+_DRAWN = ("paths", "path_groups")
+
+
+def _without_paths(result: dict[str, Any] | None) -> dict[str, Any] | None:
+    if result is None:
+        return None
+    short = dict(result)
+    for name in ("before", "after"):
+        if isinstance(short.get(name), dict):
+            short[name] = {key: short[name][key] for key in short[name] if key not in _DRAWN}
+    return short
 
 
 def _rounds_out(session: Session, rows: Sequence[Round]) -> list[RoundOut]:
@@ -62,11 +84,23 @@ def _get_round(session: Session, round_id: int) -> Round:
 
 
 @router.get("/campaigns/{campaign_id}/rounds")
-def list_rounds(campaign_id: PathId, _me: Staff, session: ReadSession) -> list[RoundOut]:
-    """Rounds of the campaign, newest first."""
+def list_rounds(
+    campaign_id: PathId,
+    _me: Staff,
+    session: ReadSession,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[RoundOut]:
+    """Rounds of the campaign, newest first; without the paths that their evaluations draw."""
     get_campaign(session, campaign_id)
-    query = select(Round).where(Round.campaign_id == campaign_id).order_by(Round.id.desc())
-    return _rounds_out(session, session.scalars(query).all())
+    query = select(Round).where(Round.campaign_id == campaign_id)
+    rows, next_cursor = page(
+        session, query, Round.id, limit=limit, cursor=cursor, newest_first=True
+    )
+    items = _rounds_out(session, rows)
+    for item in items:
+        item.result = _without_paths(item.result)
+    return Page[RoundOut](items=items, next_cursor=next_cursor)
 
 
 @router.post("/campaigns/{campaign_id}/rounds", status_code=status.HTTP_202_ACCEPTED)
@@ -121,19 +155,37 @@ def round_curves(round_id: PathId, _me: Staff, session: ReadSession) -> list[dic
     return list(session.scalars(query.order_by(Event.id)))
 
 
+def _checkpoints_out(session: Session, rows: Sequence[Checkpoint]) -> list[CheckpointOut]:
+    compared = checkpoints.from_comparison_rounds(session, rows)
+    names = [name for name in CheckpointOut.model_fields if name != "comparison"]
+    return [
+        CheckpointOut(comparison=row.id in compared, **{name: getattr(row, name) for name in names})
+        for row in rows
+    ]
+
+
 @router.get("/checkpoints")
 def list_checkpoints(
-    _me: Staff, session: ReadSession, task: ShortText | None = None
-) -> list[CheckpointOut]:
+    _me: Staff,
+    session: ReadSession,
+    task: ShortText | None = None,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[CheckpointOut]:
     """Checkpoints, newest first."""
-    rows = checkpoints.list_checkpoints(session, task=task)
-    return [CheckpointOut.model_validate(row) for row in rows]
+    query = select(Checkpoint)
+    if task is not None:
+        query = query.where(Checkpoint.task == task)
+    rows, next_cursor = page(
+        session, query, Checkpoint.id, limit=limit, cursor=cursor, newest_first=True
+    )
+    return Page[CheckpointOut](items=_checkpoints_out(session, rows), next_cursor=next_cursor)
 
 
 @router.get("/checkpoints/{checkpoint_id}")
 def get_checkpoint(checkpoint_id: PathId, _me: Staff, session: ReadSession) -> CheckpointOut:
     """One checkpoint."""
-    return CheckpointOut.model_validate(checkpoints.get_checkpoint(session, checkpoint_id))
+    return _checkpoints_out(session, [checkpoints.get_checkpoint(session, checkpoint_id)])[0]
 
 
 @router.get("/checkpoints/{checkpoint_id}/lineage")
@@ -142,7 +194,27 @@ def checkpoint_lineage(
 ) -> list[LineageStep]:
     """The checkpoint and its parents, down to the labels behind each."""
     steps = checkpoints.lineage(session, checkpoint_id)
-    return [LineageStep.model_validate(step) for step in steps]
+    shown = _checkpoints_out(session, [step["checkpoint"] for step in steps])
+    return [
+        LineageStep.model_validate(step | {"checkpoint": checkpoint})
+        for step, checkpoint in zip(steps, shown, strict=True)
+    ]
+
+
+@router.get("/checkpoints/{checkpoint_id}/labels")
+def checkpoint_labels(
+    checkpoint_id: PathId,
+    _me: Staff,
+    session: ReadSession,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[LabelBehind]:
+    """The labels that the checkpoint learned from, oldest first."""
+    rows, next_cursor = checkpoints.labels_behind(
+        session, checkpoint_id, limit=limit, cursor=cursor
+    )
+    items = [LabelBehind.model_validate(row) for row in rows]
+    return Page[LabelBehind](items=items, next_cursor=next_cursor)
 
 
 @router.get("/jobs")

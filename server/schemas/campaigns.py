@@ -133,6 +133,7 @@ class StatsOut(Out):
     labels: LabelCounts
     annotators: list[AnnotatorCounts]
     jobs: JobCounts
+    rollback_checkpoint_id: int | None  # what a rollback would publish
 
 
 class PublishRequest(In):

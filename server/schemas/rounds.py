@@ -35,7 +35,7 @@ class RoundCreate(In):
 
 
 class RoundOut(Out):
-    """A round; `labels` is the size of its snapshot."""
+    """A round; `labels` is the size of its snapshot. In lists `result` has no paths."""
 
     id: int
     campaign_id: int
@@ -99,6 +99,7 @@ class CheckpointOut(Out):
     parent_id: int | None
     round_id: int | None
     snapshot_digest: str | None
+    comparison: bool  # of a round that is never published
     config: dict[str, Any]
     metrics: dict[str, Any]
     code_version: str
@@ -113,6 +114,14 @@ class LabelsOfAnnotator(Out):
     labels: int
 
 
+class LabelBehind(Out):
+    """One label that a checkpoint learned from."""
+
+    id: int
+    pair_id: int
+    annotator_id: int
+
+
 class LineageStep(Out):
     """One checkpoint of the chain, with what made it."""
 
@@ -121,8 +130,8 @@ class LineageStep(Out):
     config: dict[str, Any] | None
     config_digest: str | None
     snapshot_digest: str | None
+    labels: int
     labels_by_annotator: list[LabelsOfAnnotator]
-    label_ids: list[int]
     code_version: str
 
 

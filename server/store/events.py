@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from server.store.tables import AuditEntry, Event
@@ -39,6 +39,11 @@ def add_event(
     )
     session.add(event)
     return event
+
+
+def newest_event_id(session: Session) -> int:
+    """Id of the newest event of all, or 0."""
+    return session.scalar(select(func.max(Event.id))) or 0
 
 
 def events_after(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, Subquery, case, func, select, union_all
+from sqlalchemy import CTE, ColumnElement, Select, Subquery, case, func, select, union_all
 from sqlalchemy.orm import Session, aliased
 
 from server.states import DECISIVE, PairState
@@ -38,30 +38,31 @@ def open_pairs(
     *,
     labels_per_pair: int,
     telling_first: bool = False,
-) -> Select[Pair]:
+) -> Select[Pair, int]:
     """Ready pairs with room for one more label, which this annotator has neither done nor got.
+
+    Beside each stands how many labels in force and live leases it has.
 
     Those with most room come first, then the oldest, or with `telling_first` those of which the
     labels so far say that people will prefer one side. Sets instead of a look-up per pair: with
     thousands of pairs that is many times faster on both engines.
     """
-    labels = select(Label.pair_id).where(Label.campaign_id == campaign_id, is_effective())
-    leases = select(Lease.pair_id).where(_is_live(now))
-    others = union_all(
-        labels.where(Label.annotator_id != annotator_id),
-        leases.where(Lease.annotator_id != annotator_id),
-    ).subquery()
-    taken = (
-        select(others.c.pair_id, func.count().label("count")).group_by(others.c.pair_id).subquery()
+    mine = select(Label.pair_id).where(
+        Label.campaign_id == campaign_id, Label.annotator_id == annotator_id, is_effective()
     )
-    count = func.coalesce(taken.c["count"], 0)
+    leases = select(Lease.pair_id).where(_is_live(now))
+    labelled = _labels_by_pair(campaign_id)
+    held = leases.add_columns(func.count().label("count")).group_by(Lease.pair_id).subquery()
+    # All that is taken is taken by others, because the annotator's own pairs are left out.
+    count = func.coalesce(labelled.c.total, 0) + func.coalesce(held.c["count"], 0)
     query = (
-        select(Pair)
-        .outerjoin(taken, taken.c.pair_id == Pair.id)
+        select(Pair, count.label("taken"))
+        .outerjoin(labelled, labelled.c.pair_id == Pair.id)
+        .outerjoin(held, held.c.pair_id == Pair.id)
         .where(
             Pair.campaign_id == campaign_id,
             Pair.state == PairState.READY,
-            Pair.id.not_in(labels.where(Label.annotator_id == annotator_id)),
+            Pair.id.not_in(mine),
             Pair.id.not_in(leases.where(Lease.annotator_id == annotator_id)),
             count < labels_per_pair,
         )
@@ -69,13 +70,28 @@ def open_pairs(
     )
     if telling_first:
         kinds = _with_kinds(query)
-        told = _told_by_kinds(campaign_id)
+        told = _told_by_kinds(labelled)
         known = (told.c.one == kinds.one) & (told.c.other == kinds.other)
         # The mean of a rate after `total` labels, if nothing was known of it before: what nobody
         # has seen yet stands in the middle, and so is tried before what tells nothing.
         rate = func.coalesce((told.c.decided + 1.0) / (told.c.total + 2.0), 0.5)
         query = kinds.query.outerjoin(told, known).order_by(rate.desc())
     return query.order_by(Pair.id)
+
+
+def _labels_by_pair(campaign_id: int) -> CTE:
+    """For each pair with labels in force how many it has, and how many of these prefer a side."""
+    decisive = case((Label.choice.in_(DECISIVE), 1), else_=0)
+    return (
+        select(
+            Label.pair_id,
+            func.count().label("total"),
+            func.sum(decisive).label("decided"),
+        )
+        .where(Label.campaign_id == campaign_id, is_effective())
+        .group_by(Label.pair_id)
+        .cte("labelled")
+    )
 
 
 @dataclass(frozen=True)
@@ -104,17 +120,15 @@ def _with_kinds(query: Select[Any]) -> _Kinds:
     )
 
 
-def _told_by_kinds(campaign_id: int) -> Subquery:
+def _told_by_kinds(labelled: CTE) -> Subquery:
     """How many labels in force compared two kinds of episodes, and how many preferred a side."""
-    labels = select(Label).join(Pair, Pair.id == Label.pair_id)
-    kinds = _with_kinds(labels.where(Label.campaign_id == campaign_id, is_effective()))
-    decisive = case((Label.choice.in_(DECISIVE), 1), else_=0)
+    kinds = _with_kinds(select(labelled).join(Pair, Pair.id == labelled.c.pair_id))
     return (
         kinds.query.with_only_columns(
             kinds.one.label("one"),
             kinds.other.label("other"),
-            func.count().label("total"),
-            func.sum(decisive).label("decided"),
+            func.sum(labelled.c.total).label("total"),
+            func.sum(labelled.c.decided).label("decided"),
         )
         .group_by(kinds.one, kinds.other)
         .subquery()
@@ -131,6 +145,14 @@ def count_taken(session: Session, now: datetime, pair_id: int, annotator_id: int
     )
     both = union_all(labels, leases).subquery()
     return session.execute(select(func.count()).select_from(both)).scalar_one()
+
+
+def has_labelled(session: Session, pair_id: int, annotator_id: int) -> bool:
+    """Whether a label of the annotator on the pair is in force."""
+    mine = select(Label.id).where(
+        Label.pair_id == pair_id, Label.annotator_id == annotator_id, is_effective()
+    )
+    return session.scalars(mine.limit(1)).first() is not None
 
 
 def count_by_state(session: Session, campaign_id: int) -> dict[PairState, int]:

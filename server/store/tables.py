@@ -26,6 +26,7 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    text,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
@@ -202,9 +203,10 @@ class Pair(Base):
     __table_args__ = (
         UniqueConstraint("campaign_id", "first_episode_id", "second_episode_id"),
         CheckConstraint("first_episode_id <> second_episode_id", name="two_episodes"),
+        Index("ix_pair_campaign_id_state", "campaign_id", "state"),
     )
     id: Mapped[int] = mapped_column(primary_key=True)
-    campaign_id: Mapped[int] = mapped_column(ForeignKey("campaign.id"), index=True)
+    campaign_id: Mapped[int] = mapped_column(ForeignKey("campaign.id"))
     first_episode_id: Mapped[int] = mapped_column(ForeignKey("episode.id"))
     second_episode_id: Mapped[int] = mapped_column(ForeignKey("episode.id"))
     first_is_left: Mapped[bool]
@@ -219,10 +221,21 @@ class Lease(Base):
     """A pair handed to an annotator for a while. A late label is kept all the same."""
 
     __tablename__ = "lease"
-    __table_args__ = (Index("ix_lease_pair_id_expires_at", "pair_id", "expires_at"),)
+    __table_args__ = (
+        Index("ix_lease_pair_id_expires_at", "pair_id", "expires_at"),
+        Index("ix_lease_of_annotator", "annotator_id", "closed_at", "expires_at", "pair_id"),
+        Index(  # those that may still be live: few, however many there ever were
+            "ix_lease_open",
+            "pair_id",
+            "annotator_id",
+            "expires_at",
+            sqlite_where=text("closed_at IS NULL"),
+            postgresql_where=text("closed_at IS NULL"),
+        ),
+    )
     id: Mapped[int] = mapped_column(primary_key=True)
     pair_id: Mapped[int] = mapped_column(ForeignKey("pair.id"))
-    annotator_id: Mapped[int] = mapped_column(ForeignKey("annotator.id"), index=True)
+    annotator_id: Mapped[int] = mapped_column(ForeignKey("annotator.id"))
     issued_at: Mapped[datetime]
     expires_at: Mapped[datetime]
     closed_at: Mapped[datetime | None]  # labelled or given back
@@ -232,11 +245,24 @@ class Label(Base):
     """One click, for ever. Undo and edit are new rows that point at what they supersede."""
 
     __tablename__ = "label"
-    __table_args__ = (UniqueConstraint("annotator_id", "idempotency_key"),)
+    __table_args__ = (
+        UniqueConstraint("annotator_id", "idempotency_key"),
+        # All that the hand-out and the figures ask of a label: the rows themselves are wide.
+        Index(
+            "ix_label_of_campaign",
+            "campaign_id",
+            "pair_id",
+            "annotator_id",
+            "choice",
+            "retracted",
+            "duration_ms",
+        ),
+        Index("ix_label_of_annotator", "annotator_id", "campaign_id", "pair_id", "retracted"),
+    )
     id: Mapped[int] = mapped_column(primary_key=True)
-    campaign_id: Mapped[int] = mapped_column(ForeignKey("campaign.id"), index=True)
+    campaign_id: Mapped[int] = mapped_column(ForeignKey("campaign.id"))
     pair_id: Mapped[int] = mapped_column(ForeignKey("pair.id"), index=True)
-    annotator_id: Mapped[int] = mapped_column(ForeignKey("annotator.id"), index=True)
+    annotator_id: Mapped[int] = mapped_column(ForeignKey("annotator.id"))
     choice: Mapped[str] = mapped_column(String(16))  # Choice; the superseded one's for a retraction
     retracted: Mapped[bool] = mapped_column(Boolean, default=False)  # True: an undo row
     supersedes_id: Mapped[int | None] = mapped_column(ForeignKey("label.id"), unique=True)
@@ -339,6 +365,7 @@ class Event(Base):
     """
 
     __tablename__ = "event"
+    __table_args__ = (Index("ix_event_campaign_id_kind", "campaign_id", "kind"),)
     id: Mapped[int] = mapped_column(primary_key=True)
     campaign_id: Mapped[int] = mapped_column(ForeignKey("campaign.id"), index=True)
     round_id: Mapped[int | None] = mapped_column(ForeignKey("round.id"), index=True)

@@ -60,7 +60,7 @@ def test_each_annotator_labels_with_an_account_of_its_own(api: RunningApi):
     campaign = api.make_campaign(OUTCOMES, "own accounts")
     run(api, campaign, annotators=4, labels=36, name="crew")
     with api.admin() as admin:
-        accounts = {a["name"]: a for a in admin.get("/annotators") if a["name"][:4] == "crew"}
+        accounts = {a["name"]: a for a in admin.pages("/annotators") if a["name"][:4] == "crew"}
     assert set(accounts) == {"crew-1", "crew-2", "crew-3", "crew-4"}
     assert {a["kind"] for a in accounts.values()} == {"simulated"}
     by_account = Counter(label.annotator_id for label, _, _ in rows_of(api, campaign))
@@ -77,8 +77,8 @@ def test_tokens_are_revoked_when_all_is_labelled_and_when_it_fails(api: RunningA
         admin.post("/annotators", person | {"password": "long enough"})
         with pytest.raises(RodifError, match="'token-4' is a person"):
             simulate(admin, campaign, SimulationConfig(name="token", annotators=4))
-        mine = {a["id"] for a in admin.get("/annotators") if a["name"][:6] == "token-"}
-        tokens = [token for token in admin.get("/tokens") if token["annotator_id"] in mine]
+        mine = {a["id"] for a in admin.pages("/annotators") if a["name"][:6] == "token-"}
+        tokens = [token for token in admin.pages("/tokens") if token["annotator_id"] in mine]
     assert len(tokens) == 6
     assert all(token["revoked_at"] for token in tokens)
 

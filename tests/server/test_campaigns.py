@@ -44,7 +44,7 @@ def test_a_campaign_takes_its_defaults_from_the_task(world: World, checkpoint_id
         "archived": False,
         "created_at": "2026-11-22T12:00:00Z",
     }
-    history = world.client("ada").get("/campaigns/1/publications").json()
+    history = world.client("ada").get("/campaigns/1/publications").json()["items"]
     assert [(row["action"], row["checkpoint_id"]) for row in history] == [("start", checkpoint_id)]
     (task,) = world.client("sam").get("/tasks").json()
     assert (task["name"], task["preferred_group"], task["checkpoints"]) == ("avoid", "left", 1)
@@ -240,9 +240,28 @@ def test_stats_count_what_is_in_force(world: World) -> None:
             },
         ],
         "jobs": {"queued": 0, "running": 0, "failed": 1},
+        "rollback_checkpoint_id": None,
     }
-    accounts = world.client("ada").get("/annotators").json()
+    accounts = world.client("ada").get("/annotators").json()["items"]
     assert {row["name"]: row["labels"] for row in accounts}["ann"] == 2
+
+
+@pytest.mark.parametrize(
+    ("durations", "median"),
+    [([], None), ([None], None), ([7], 7.0), ([9, 1, 5], 5.0), ([4, 100, 1, 2, None], 3.0)],
+)
+def test_the_median_is_that_of_the_durations_that_are_known(
+    world: World, durations: list[int | None], median: float | None
+) -> None:
+    campaign_id, pair_ids = world.add_campaign(pairs=6)
+    with world.database.write() as session:
+        pairs = [session.get_one(factories.Pair, pair_id) for pair_id in pair_ids]
+        for pair, duration in zip(pairs, durations, strict=False):
+            factories.add_label(session, pair, world.ids["ann"], duration_ms=duration)
+        factories.add_label(session, pairs[-1], world.ids["bob"], duration_ms=50)
+    stats = world.client("ada").get(f"/campaigns/{campaign_id}/stats").json()
+    found = {row["name"]: row["median_duration_ms"] for row in stats["annotators"]}
+    assert found == ({"ann": median} if durations else {}) | {"bob": 50.0}
 
 
 def test_episodes_and_pairs_are_listed_by_pages_and_filters(world: World) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -101,6 +102,35 @@ def test_a_follower_who_comes_back_misses_nothing_and_sees_nothing_twice(
     assert ids == sorted(set(ids))
 
 
+def _url_of(address: str, round_id: int, after: object) -> str:
+    return f"{address}/rounds/{round_id}/events?after={after}"
+
+
+def test_a_follower_from_now_on_is_not_told_the_history(
+    world: World, address: str, round_id: int
+) -> None:
+    for step in range(3):
+        _curve(world, round_id, step)
+    with (
+        _stream(world, address) as client,
+        client.stream("GET", _url_of(address, round_id, "now")) as response,
+    ):
+        lines = response.iter_lines()
+        opening = list(islice(lines, 3))  # sent at once, so what follows is not missed
+        _curve(world, round_id, 3)
+        _finish(world, round_id)
+        rest = [line for line in lines if line.startswith("data: ") and '"step"' in line]
+    assert opening[0] == "retry: 1000" and opening[2] == ""
+    newest = int(opening[1].removeprefix("id: "))
+    assert [json.loads(line.removeprefix("data: "))["step"] for line in rest] == [3]
+    for after, header in ((newest, None), ("now", newest), (0, newest)):
+        with (
+            _stream(world, address, after=header) as client,
+            client.stream("GET", _url_of(address, round_id, after)) as response,
+        ):
+            assert _brief(list(read_events(response)))[0] == ("curve", 3)
+
+
 def test_a_campaign_tells_everything_of_its_own_and_nothing_else(
     world: World, address: str, round_id: int
 ) -> None:
@@ -168,5 +198,6 @@ def test_unknown_rounds_and_annotators_get_an_answer_and_no_stream(
         assert client.get("/campaigns/99/events").status_code == 404
         ann = {"Authorization": f"Bearer {world.tokens['ann']}"}
         assert client.get(f"/rounds/{round_id}/events", headers=ann).status_code == 403
+        assert client.get(f"/rounds/{round_id}/events?after=then").status_code == 422
         odd = {"Last-Event-ID": "yesterday"}
         assert client.get(f"/rounds/{round_id}/events", headers=odd).status_code == 422

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy import func, select
 
-from server.handout import Handout, NothingReason, next_pair
+from server.handout import Handout, NothingReason, Outlook, look_ahead, next_pair
 from server.labeling import ScreenChoice, Submission, submit_label
 from server.states import PairState
 from server.store.session import Database
@@ -235,6 +235,79 @@ def test_annotators_who_ask_at_once_never_crowd_a_pair(
     counts = Counter(pair_id for pair_id in given if pair_id is not None)
     assert max(counts.values()) <= labels_per_pair
     assert sum(counts.values()) == min(10, 3 * labels_per_pair)  # and no room stays unused
+
+
+def _foresee(database: Database, campaign_id: int, annotator_id: int) -> Outlook:
+    with database.read() as session:
+        outlook = look_ahead(session, NOW, campaign_id, annotator_id)
+    assert outlook is not None
+    return outlook
+
+
+def _take_foreseen(
+    database: Database, campaign_id: int, annotator_id: int, outlook: Outlook
+) -> int | None:
+    with database.write() as session:
+        found = next_pair(session, NOW, campaign_id, annotator_id, lease_for=LEASE, outlook=outlook)
+        return found.pair.id if isinstance(found, Handout) else None
+
+
+def test_annotators_who_foresee_the_same_pairs_get_them_one_by_one(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session, labels_per_pair=2)
+        pairs = [pair.id for pair in factories.add_pairs(session, campaign, 3)]
+        people = [factories.add_me(session, f"p{i}").id for i in range(4)]
+    seen = [_foresee(database, campaign.id, who) for who in people]
+    assert [outlook.pairs for outlook in seen] == [tuple((pair, 0) for pair in pairs)] * 4
+    got = [
+        _take_foreseen(database, campaign.id, who, outlook)
+        for who, outlook in zip(people, seen, strict=True)
+    ]
+    # The last one finds all three changed and searches again: fewest labels first, then the oldest.
+    assert got == [*pairs, pairs[0]]
+
+
+def test_an_outlook_from_before_the_own_last_pair_is_not_used(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session)
+        pairs = [pair.id for pair in factories.add_pairs(session, campaign, 3)]
+        me = factories.add_me(session, "ann")
+    old = _foresee(database, campaign.id, me.id)
+    assert _take(database, campaign.id, me.id) == pairs[0]
+    with database.write() as session:
+        answer = Submission(pairs[0], ScreenChoice.LEFT)
+        submit_label(session, NOW, me, answer, idempotency_key="a")
+    # Or an outlook could bring back a pair that was judged in the meantime.
+    assert _take_foreseen(database, campaign.id, me.id, old) == pairs[1]
+
+
+def test_a_foreseen_pair_whose_late_label_came_meanwhile_is_left_out(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session)
+        pairs = [pair.id for pair in factories.add_pairs(session, campaign, 2)]
+        me = factories.add_me(session, "ann")
+    assert _take(database, campaign.id, me.id) == pairs[0]
+    later = NOW + 2 * LEASE
+    with database.read() as session:
+        outlook = look_ahead(session, later, campaign.id, me.id)
+    assert outlook is not None and [pair for pair, _ in outlook.pairs] == pairs
+    with database.write() as session:
+        answer = Submission(pairs[0], ScreenChoice.LEFT)
+        submit_label(session, later, me, answer, idempotency_key="a")
+        found = next_pair(session, later, campaign.id, me.id, lease_for=LEASE, outlook=outlook)
+        assert isinstance(found, Handout) and found.pair.id == pairs[1]
+
+
+def test_nothing_is_foreseen_when_the_answer_is_held_already(database: Database) -> None:
+    with database.write() as session:
+        campaign = factories.add_campaign(session)
+        factories.add_pairs(session, campaign, 2)
+        me = factories.add_me(session, "ann")
+    _take(database, campaign.id, me.id)
+    with database.read() as session:
+        assert look_ahead(session, NOW, campaign.id, me.id) is None
+        assert look_ahead(session, NOW, campaign.id, me.id, hold=2) is not None
+        assert look_ahead(session, NOW, 99, me.id) is None
 
 
 def test_two_tabs_of_one_annotator_hold_one_pair(database: Database) -> None:

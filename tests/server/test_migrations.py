@@ -37,7 +37,7 @@ def test_two_processes_that_upgrade_together_both_succeed(empty_url: str) -> Non
 
 
 def test_a_database_without_migrations_is_refused_with_what_to_run(empty_url: str) -> None:
-    with pytest.raises(DatabaseVersionError, match=r"at migration None.*needs '0001'.*rodif up"):
+    with pytest.raises(DatabaseVersionError, match=r"at migration None.*needs '0002'.*rodif up"):
         migrate.check_at_head(empty_url)
 
 

@@ -55,7 +55,7 @@ def test_publishing_and_rolling_back_walk_through_the_history(
     end = _roll_back(world, campaign_id)
     assert end.status_code == 409 and "nothing to roll back" in end.json()["detail"]
     assert _publish(world, campaign_id, 3).status_code == 201
-    history = world.client("ada").get(f"/campaigns/{campaign_id}/publications").json()
+    history = world.client("ada").get(f"/campaigns/{campaign_id}/publications").json()["items"]
     assert [(row["action"], row["checkpoint_id"]) for row in reversed(history)] == [
         ("start", 1),
         ("publish", 2),
@@ -98,6 +98,24 @@ def test_what_cannot_be_published_is_refused_with_the_reason(
         answer = _publish(world, campaign_id, checkpoint_id)
         assert answer.status_code == status and words in answer.json()["detail"]
     assert _published(world, campaign_id) == 1
+    listed = world.client("ada").get("/checkpoints?limit=2").json()
+    assert [(row["id"], row["comparison"]) for row in listed["items"]] == [(5, True), (4, False)]
+    assert listed["next_cursor"] == 4
+
+
+def test_figures_tell_what_a_rollback_would_publish(world: World, campaign_id: int) -> None:
+    def told() -> int | None:
+        stats = world.client("ada").get(f"/campaigns/{campaign_id}/stats").json()
+        target: int | None = stats["rollback_checkpoint_id"]
+        return target
+
+    assert told() is None
+    _publish(world, campaign_id, 2)
+    assert told() == 1
+    _publish(world, campaign_id, 1)  # the start again, but not at the start of its history
+    assert told() == 2
+    assert _roll_back(world, campaign_id).status_code == 201
+    assert (_published(world, campaign_id), told()) == (2, 1)
 
 
 def test_another_pretrained_policy_can_be_published_before_there_are_runs(world: World) -> None:
@@ -112,7 +130,7 @@ def test_the_gate_publishes_without_an_account(world: World, campaign_id: int) -
         publications.publish(
             session, NOW, campaign_id=campaign_id, checkpoint_id=2, reason="passed", by=None
         )
-    history = world.client("ada").get(f"/campaigns/{campaign_id}/publications").json()
+    history = world.client("ada").get(f"/campaigns/{campaign_id}/publications").json()["items"]
     assert (history[0]["reason"], history[0]["by_annotator_id"]) == ("passed", None)
 
 
@@ -140,14 +158,26 @@ def test_lineage_leads_from_the_policy_to_the_clicks(world: World, campaign_id: 
     assert newest["config"] == client.get(f"/rounds/{made_by.id}").json()["config"]
     assert len(newest["config_digest"]) == 64
     assert newest["snapshot_digest"] == made_by.snapshot_digest
-    assert newest["label_ids"] == [label.id, other.id]
+    assert newest["labels"] == 2
     assert newest["labels_by_annotator"] == [
         {"annotator_id": world.ids["ann"], "name": "ann", "labels": 1},
         {"annotator_id": world.ids["bob"], "name": "bob", "labels": 1},
     ]
-    assert (oldest["checkpoint"]["id"], oldest["label_ids"]) == (1, [])
+    assert (oldest["checkpoint"]["id"], oldest["labels"]) == (1, 0)
+    assert oldest["labels_by_annotator"] == []
+    clicks = [
+        {"id": label.id, "pair_id": 1, "annotator_id": world.ids["ann"]},
+        {"id": other.id, "pair_id": 2, "annotator_id": world.ids["bob"]},
+    ]
+    path = f"/checkpoints/{candidate.id}/labels"
+    assert client.get(path).json() == {"items": clicks, "next_cursor": None}
+    assert client.get(f"{path}?limit=1").json() == {"items": clicks[:1], "next_cursor": label.id}
+    rest = client.get(f"{path}?limit=1&cursor={label.id}").json()
+    assert rest == {"items": clicks[1:], "next_cursor": None}
+    assert client.get("/checkpoints/1/labels").json() == {"items": [], "next_cursor": None}
+    assert client.get("/checkpoints/77/labels").status_code == 404
     assert (oldest["config_digest"], oldest["code_version"]) == (None, "0.1.0")
     assert client.get(f"/rounds/{made_by.id}").json()["candidate_checkpoint_id"] == candidate.id
-    assert client.get("/checkpoints?task=avoid").json()[0]["id"] == candidate.id
-    assert client.get("/checkpoints?task=other").json() == []
+    assert client.get("/checkpoints?task=avoid").json()["items"][0]["id"] == candidate.id
+    assert client.get("/checkpoints?task=other").json()["items"] == []
     assert client.get("/checkpoints/77/lineage").status_code == 404

@@ -55,6 +55,7 @@ ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/checkpoints", None, STAFF),
     ("GET", "/checkpoints/1", None, STAFF),
     ("GET", "/checkpoints/1/lineage", None, STAFF),
+    ("GET", "/checkpoints/1/labels", None, STAFF),
     ("POST", "/campaigns/1/publish", {"checkpoint_id": 1, "reason": ""}, ADMIN),
     ("POST", "/campaigns/1/rollback", {"reason": ""}, ADMIN),
     ("GET", "/campaigns/1/publications", None, ADMIN),

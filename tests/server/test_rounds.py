@@ -14,7 +14,7 @@ from sqlalchemy import select
 from server import rounds
 from server.errors import ConflictError, NotFoundError
 from server.rounds import RoundRequest
-from server.snapshots import freeze_snapshot
+from server.snapshots import freeze_snapshot, new_labels_since_round
 from server.states import (
     Choice,
     JobKind,
@@ -27,7 +27,7 @@ from server.states import (
 from server.store import jobs
 from server.store.labels import snapshot_labels
 from server.store.session import Database
-from server.store.tables import Event, Job, LabelSnapshot, Pair, Round
+from server.store.tables import Event, Job, Label, LabelSnapshot, Pair, Round
 from tests import factories
 from tests.factories import NOW
 from tests.server.threads import at_once
@@ -65,7 +65,7 @@ def test_a_launched_round_is_frozen_queued_and_can_be_followed(world: World) -> 
     assert job.dedupe_key == f"finetune:{found['id']}"
     assert world.sent == [(job.id, JobKind.FINETUNE)]
     assert world.client("ada").get(f"/rounds/{found['id']}").json() == found
-    assert world.client("ada").get(f"/campaigns/{campaign_id}/rounds").json() == [found]
+    assert world.client("ada").get(f"/campaigns/{campaign_id}/rounds").json()["items"] == [found]
 
 
 def test_a_snapshot_holds_the_last_word_of_each_annotator_on_each_pair(database: Database) -> None:
@@ -104,7 +104,8 @@ def test_a_snapshot_is_the_same_until_a_label_comes_and_never_changes(database: 
         factories.add_label(session, pairs[1], ann)
         second = freeze_snapshot(session, later, campaign.id)
         assert second.digest != first
-        assert [row.id for row in snapshot_labels(session, first)] == [label.id]
+        held = snapshot_labels(session, first, Label.choice, Label.annotator_id)
+        assert [tuple(row) for row in held] == [(label.id, "first", ann)]
         with pytest.raises(NotFoundError, match="no label snapshot 'zzz'"):
             snapshot_labels(session, "zzz")
 
@@ -352,6 +353,23 @@ def test_curves_are_the_points_of_the_round_in_order(world: World) -> None:
     assert points[1] == {"stage": "score", "step": 1, "loss": 0.5}
 
 
+def test_rounds_are_listed_newest_first_without_what_their_evaluations_draw(world: World) -> None:
+    campaign_id = _labelled(world)
+    ids = [_launch(world, campaign_id, publish_rule="never").json()["id"] for _ in range(3)]
+    evaluation = {"success": 0.5, "n": 2, "paths": [[[0, 1]]], "path_groups": ["left"]}
+    result = {"before": evaluation, "after": evaluation, "gate": {"passed": True}, "seconds": {}}
+    with world.database.write() as session:
+        session.get_one(Round, ids[2]).result = result
+    client = world.client("sam")
+    first = client.get(f"/campaigns/{campaign_id}/rounds?limit=2").json()
+    assert [row["id"] for row in first["items"]] == [ids[2], ids[1]]
+    short = {"success": 0.5, "n": 2}
+    assert first["items"][0]["result"] == result | {"before": short, "after": short}
+    rest = client.get(f"/campaigns/{campaign_id}/rounds?cursor={first['next_cursor']}").json()
+    assert [row["id"] for row in rest["items"]] == [ids[0]] and rest["next_cursor"] is None
+    assert client.get(f"/rounds/{ids[2]}").json()["result"] == result
+
+
 def _add_labels(session: Any, campaign_id: int, pairs: slice) -> None:
     owner = session.get_one(factories.Campaign, campaign_id).created_by
     rows = session.scalars(select(Pair).where(Pair.campaign_id == campaign_id).order_by(Pair.id))
@@ -384,13 +402,103 @@ def test_a_round_is_due_after_enough_new_labels(database: Database) -> None:
         started = rounds.launch_due(session, NOW, campaign_id)
         assert started is not None and started.trigger == RoundTrigger.LABELS
     assert _due(database, campaign_id) is None  # it runs
+    _end(database, started.id, RoundState.REJECTED)
     with database.write() as session:
-        rounds.move(session, NOW, started.id, RoundState.FAILED)
         _add_labels(session, campaign_id, slice(3, 5))
     assert _due(database, campaign_id) is None  # two new ones only
     with database.write() as session:
         _add_labels(session, campaign_id, slice(5, 6))
     assert _due(database, campaign_id) is RoundTrigger.LABELS
+
+
+def _end(database: Database, round_id: int, state: RoundState, minutes: float = 0) -> None:
+    """Take the round to its end, by way of the gate if it has one."""
+    with database.write() as session:
+        gated = () if state in (RoundState.FAILED, RoundState.CANCELLED) else tuple(PATH[:3])
+        for step in (*gated, state):
+            rounds.move(session, NOW + timedelta(minutes=minutes), round_id, step)
+
+
+def _new_labels(database: Database, campaign_id: int) -> int:
+    with database.read() as session:
+        return new_labels_since_round(session, campaign_id)
+
+
+@pytest.mark.parametrize("state", [RoundState.FAILED, RoundState.CANCELLED])
+@pytest.mark.parametrize("reached", [[], PATH[:1], PATH[:2]])
+def test_labels_of_a_round_that_came_to_nothing_are_new_again(
+    database: Database, state: RoundState, reached: list[RoundState]
+) -> None:
+    campaign_id = _campaign(database, round_after_labels=4)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 4))
+        started = rounds.launch(session, NOW, campaign_id, RoundRequest())
+        for step in reached:
+            rounds.move(session, NOW, started.id, step)
+    assert _new_labels(database, campaign_id) == 0  # it learns from them
+    _end(database, started.id, state)
+    assert _new_labels(database, campaign_id) == 4
+    assert _due(database, campaign_id, minutes=9.9) is None
+    assert _due(database, campaign_id, minutes=10) is RoundTrigger.LABELS
+
+
+def test_rounds_that_come_to_nothing_again_and_again_wait_longer_each_time(
+    database: Database,
+) -> None:
+    campaign_id = _campaign(database, round_after_labels=1, round_every_minutes=1.0)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+    at = 0.0
+    for rest in (10, 20, 40, 80):
+        with database.write() as session:
+            started = rounds.launch_due(session, NOW + timedelta(minutes=at), campaign_id)
+            assert started is not None
+        _end(database, started.id, RoundState.FAILED, minutes=at)
+        assert _due(database, campaign_id, minutes=at + rest - 0.1) is None
+        at += rest
+    with database.write() as session:  # one that comes to its end makes the next rest short again
+        started = rounds.launch_due(session, NOW + timedelta(minutes=at), campaign_id)
+        assert started is not None
+    _end(database, started.id, RoundState.KEPT, minutes=at)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(2, 3))
+    assert _due(database, campaign_id, minutes=at) is RoundTrigger.LABELS
+
+
+def test_a_round_on_an_old_snapshot_makes_nothing_new(database: Database) -> None:
+    campaign_id = _campaign(database, round_after_labels=2)
+    digests = []
+    for labels in (slice(0, 2), slice(2, 5)):
+        with database.write() as session:
+            _add_labels(session, campaign_id, labels)
+            started = rounds.launch(session, NOW, campaign_id, RoundRequest())
+            digests.append(started.snapshot_digest)
+        _end(database, started.id, RoundState.REJECTED)
+    with database.write() as session:
+        request = RoundRequest(snapshot_digest=digests[0])
+        again = rounds.launch(session, NOW, campaign_id, request)
+    _end(database, again.id, RoundState.PUBLISHED)
+    assert _new_labels(database, campaign_id) == 0
+    assert _due(database, campaign_id, minutes=100) is None
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(5, 6))
+    assert _new_labels(database, campaign_id) == 1
+
+
+def test_a_snapshot_of_a_failed_round_counts_once_another_learned_from_it(
+    database: Database,
+) -> None:
+    campaign_id = _campaign(database)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+        failed = rounds.launch(session, NOW, campaign_id, RoundRequest())
+    _end(database, failed.id, RoundState.FAILED)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(2, 3))
+        request = RoundRequest(snapshot_digest=failed.snapshot_digest)
+        again = rounds.launch(session, NOW, campaign_id, request)
+    _end(database, again.id, RoundState.REJECTED)
+    assert _new_labels(database, campaign_id) == 1
 
 
 def test_a_round_is_due_every_few_minutes_when_there_is_something_new(database: Database) -> None:
@@ -404,7 +512,7 @@ def test_a_round_is_due_every_few_minutes_when_there_is_something_new(database: 
         at = NOW + timedelta(minutes=30)
         started = rounds.launch_due(session, at, campaign_id)
         assert started is not None
-        rounds.move(session, at, started.id, RoundState.FAILED)
+    _end(database, started.id, RoundState.REJECTED, minutes=30)
     assert _due(database, campaign_id, minutes=90) is None  # nothing new since
     with database.write() as session:
         _add_labels(session, campaign_id, slice(1, 2))
@@ -416,15 +524,17 @@ def test_nothing_is_due_when_switched_off_or_archived(database: Database) -> Non
     off = _campaign(database)
     with database.write() as session:
         _add_labels(session, off, slice(0, 8))
-        assert rounds.active_campaign_ids(session) == [off]
+        assert rounds.due_campaign_ids(session, NOW) == []
     assert _due(database, off, minutes=10_000) is None
     with database.write() as session:
         campaign = session.get_one(factories.Campaign, off)
         campaign.settings = campaign.settings | {"round_after_labels": 1}
+        session.flush()
+        assert rounds.due_campaign_ids(session, NOW) == [off]
         campaign.archived = True
     assert _due(database, off) is None
     with database.read() as session:
-        assert rounds.active_campaign_ids(session) == []
+        assert rounds.due_campaign_ids(session, NOW) == []
 
 
 def test_comparison_rounds_do_not_count_as_learning(database: Database) -> None:
@@ -443,7 +553,9 @@ def test_labels_that_say_nothing_start_no_round(database: Database) -> None:
         factories.add_label(session, pair, 1, Choice.EQUAL)
         assert rounds.launch_due(session, NOW, campaign_id) is None
     with database.read() as session:
+        assert rounds.due_campaign_ids(session, NOW) == []
         assert session.scalars(select(Round)).all() == []
+        assert session.scalars(select(LabelSnapshot)).all() == []
 
 
 def test_two_ticks_at_once_start_one_round(database: Database) -> None:

@@ -196,7 +196,7 @@ def test_a_token_is_shown_once_and_works_until_it_expires_or_is_revoked(world: W
     world.tokens["nightly"] = issued["token"]
     script = world.client("nightly")
     assert script.get("/me").json()["name"] == "sam"
-    listed = {row["id"]: row for row in admin.get("/tokens").json()}
+    listed = {row["id"]: row for row in admin.get("/tokens").json()["items"]}
     assert issued["token"] not in str(listed)
     assert listed[issued["id"]]["last_used_at"] is not None
     world.clock.advance(days=2, seconds=1)
@@ -208,7 +208,7 @@ def test_a_token_is_shown_once_and_works_until_it_expires_or_is_revoked(world: W
 
 def test_a_revoked_token_is_refused(sqlite_world: World) -> None:
     script = sqlite_world.client("ann")
-    own = script.get("/tokens").json()
+    own = script.get("/tokens").json()["items"]
     assert [row["annotator_id"] for row in own] == [sqlite_world.ids["ann"]]
     assert script.delete(f"/tokens/{own[0]['id']}").status_code == 204
     assert "revoked" in script.get("/me").json()["detail"]
@@ -226,10 +226,10 @@ def test_annotators_handle_their_own_tokens_only(sqlite_world: World) -> None:
     assert ann.delete(f"/tokens/{issued.json()['id']}").status_code == 204
     other = {"annotator_id": sqlite_world.ids["bob"], "name": "not mine"}
     assert ann.post("/tokens", json=other).status_code == 403
-    bobs = sqlite_world.client("bob").get("/tokens?mine=true").json()[0]["id"]
+    bobs = sqlite_world.client("bob").get("/tokens?mine=true").json()["items"][0]["id"]
     assert ann.delete(f"/tokens/{bobs}").status_code == 403
-    assert len(sqlite_world.client("ada").get("/tokens").json()) == 6
-    assert len(sqlite_world.client("ada").get("/tokens?mine=true").json()) == 1
+    assert len(sqlite_world.client("ada").get("/tokens").json()["items"]) == 6
+    assert len(sqlite_world.client("ada").get("/tokens?mine=true").json()["items"]) == 1
 
 
 @pytest.mark.parametrize("token", ["rdf_unknown", "", "rdf_" + "ä" * 8])
@@ -286,7 +286,7 @@ def test_changes_of_accounts_are_audited_without_secrets(world: World) -> None:
     admin.patch(f"/annotators/{created['id']}", json={"role": "service"})
     again = admin.post("/annotators", json=body)
     assert again.status_code == 409 and "'new' already" in again.json()["detail"]
-    assert "new" in [row["name"] for row in admin.get("/annotators").json()]
+    assert "new" in [row["name"] for row in admin.get("/annotators").json()["items"]]
     items = admin.get("/audit?limit=2").json()["items"]
     assert [item["action"] for item in items] == ["annotator.change", "annotator.create"]
     assert {item["actor_id"] for item in items} == {world.ids["ada"]}

@@ -13,7 +13,7 @@ from server import publications, rounds
 from server.handout import Handout, next_pair
 from server.labeling import ScreenChoice, Submission, submit_label
 from server.sign_in import me_of
-from server.states import JobKind, RoundState
+from server.states import JobKind, PublishRule, RoundState
 from server.store.events import add_event
 from server.store.tables import Annotator, Checkpoint, Job, Round
 from tests.ui.studio import Studio, episodes
@@ -44,10 +44,12 @@ def evaluation(left: int, right: int, failed: int) -> dict[str, Any]:
     }
 
 
-def label_all(studio: Studio, campaign_id: int, name: str, side: ScreenChoice) -> int:
+def label_all(
+    studio: Studio, campaign_id: int, name: str, side: ScreenChoice, at_most: int = 1000
+) -> int:
     """Label everything that is ready, past the browser; returns how many."""
     done = 0
-    while True:
+    while done < at_most:
         now = datetime.now(UTC)
         with studio.database.write() as session:
             me = me_of(session.scalars(select(Annotator).where(Annotator.name == name)).one())
@@ -55,8 +57,9 @@ def label_all(studio: Studio, campaign_id: int, name: str, side: ScreenChoice) -
             if not isinstance(found, Handout):
                 return done
             answer = Submission(found.pair.id, side, duration_ms=4200 + 100 * done)
-            submit_label(session, now, me, answer, idempotency_key=f"k{done}")
+            submit_label(session, now, me, answer, idempotency_key=f"k{found.pair.id}")
             done += 1
+    return done
 
 
 class WorkerStandIn:
@@ -89,7 +92,8 @@ class WorkerStandIn:
             add_event(session, now, kind="job", data=told, **where)
 
     def finish(self, before: dict[str, Any], after: dict[str, Any]) -> int:
-        """Candidate, evaluation, gate, publication; returns the candidate's id."""
+        """Candidate, evaluation, gate, and publication unless it is a comparison round; returns
+        the candidate's id."""
         now = datetime.now(UTC)
         with self.studio.database.write() as session:
             this = session.get_one(Round, self.round_id)
@@ -118,6 +122,10 @@ class WorkerStandIn:
             this.result = {"before": before, "after": after, "gate": gate}
             for state in (RoundState.EVALUATING, RoundState.GATING):
                 rounds.move(session, now, self.round_id, state)
+            session.get_one(Job, self.job_id).state = "done"
+            if this.publish_rule == PublishRule.NEVER:
+                rounds.move(session, now, self.round_id, RoundState.KEPT)
+                return candidate.id
             publications.publish(
                 session,
                 now,
@@ -127,5 +135,4 @@ class WorkerStandIn:
                 by=None,
             )
             rounds.move(session, now, self.round_id, RoundState.PUBLISHED)
-            session.get_one(Job, self.job_id).state = "done"
             return candidate.id

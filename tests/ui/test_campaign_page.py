@@ -9,10 +9,10 @@ import pytest
 from playwright.sync_api import Page
 from sqlalchemy import select
 
-from server import rounds
+from server import publications, rounds
 from server.labeling import ScreenChoice
-from server.states import JobKind, JobState, Role, RoundState
-from server.store.tables import Campaign, Job, Publication, Round
+from server.states import JobKind, JobState, PublishRule, Role, RoundState
+from server.store.tables import Campaign, Checkpoint, Job, Publication, Round
 from tests.ui.driving import sign_in, until
 from tests.ui.rounds import WorkerStandIn, evaluation, label_all
 from tests.ui.studio import PASSWORD, Studio
@@ -252,3 +252,127 @@ def test_new_account_can_sign_in_until_it_is_deactivated(studio: Studio, page: P
     guest.goto(f"{studio.url}/label")
     assert "/sign-in" in guest.url
     guest.context.close()
+
+
+def test_focus_and_elements_stay_where_they_are_while_the_page_refreshes(
+    studio: Studio, page: Page
+) -> None:
+    campaign = studio.add_campaign([True, False, True])
+    name = studio.add_annotator()
+    label_all(studio, campaign, name, ScreenChoice.LEFT, at_most=1)
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Start round").click()
+    confirm(page, "Start round")
+    live = page.locator(".live")
+    cancel = live.get_by_role("button", name="Cancel")
+    cancel.wait_for()
+    with studio.database.read() as session:
+        this = session.scalars(select(Round).where(Round.campaign_id == campaign)).one()
+    lineage = page.locator("#checkpoints").get_by_role("button", name="Lineage").first
+    for button in (cancel, lineage):
+        button.focus()
+        button.evaluate("button => { window.before = button; }")
+        worker = WorkerStandIn(studio, this.id)
+        if button is cancel:
+            worker.start()
+            page.locator("#live-state").get_by_text(f"Round {this.id}: Fine-tuning.").wait_for()
+        else:
+            worker.job_id = studio_job(studio, this.id)
+            worker.progress("score", 0.5)
+            live.get_by_text("score · 50 %").wait_for()
+            page.locator("#jobs").get_by_text("score").wait_for()
+        assert page.evaluate("document.activeElement === window.before")
+    assert page.locator("#live").get_attribute("aria-live") is None
+
+
+def studio_job(studio: Studio, round_id: int) -> int:
+    """The fine-tuning of a round."""
+    with studio.database.read() as session:
+        return session.scalars(select(Job.id).where(Job.round_id == round_id)).one()
+
+
+def test_a_label_event_fetches_the_figures_only_and_no_history_is_told_again(
+    studio: Studio, page: Page
+) -> None:
+    campaign = studio.add_campaign([True, False])
+    name = studio.add_annotator()
+    label_all(studio, campaign, name, ScreenChoice.LEFT, at_most=1)
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url.split("/api/v1/")[-1]))
+    open_campaign(page, studio, campaign)
+    page.wait_for_timeout(1500)  # what the first drawing leads to is over
+    assert f"campaigns/{campaign}/events?after=now" in asked
+    assert len([path for path in asked if path.endswith("/stats")]) == 1
+    asked.clear()
+    label_all(studio, campaign, name, ScreenChoice.LEFT)
+    until(page, "document.querySelectorAll('.tile .value')[2].textContent === '2'")
+    assert asked == [f"campaigns/{campaign}/stats"]
+
+
+def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
+    studio: Studio, page: Page
+) -> None:
+    other = studio.add_campaign([True])
+    label_all(studio, other, studio.add_annotator(), ScreenChoice.LEFT)
+    now = datetime.now(UTC)
+    with studio.database.write() as session:
+        request = rounds.RoundRequest(publish_rule=PublishRule.NEVER)
+        compared = rounds.launch(session, now, other, request).id
+    worker = WorkerStandIn(studio, compared)
+    worker.start()
+    comparison = worker.finish(evaluation(22, 70, 8), evaluation(91, 3, 6))
+    campaign = studio.add_campaign()
+    with studio.database.write() as session:
+        start = session.get_one(Campaign, campaign).start_checkpoint_id
+        row = session.get_one(Checkpoint, comparison)
+        second = Checkpoint(
+            task=row.task,
+            name=studio.new_name("second"),
+            digest="2" * 64,
+            artifact_sha256="0" * 64,
+            parent_id=start,
+            config=dict(row.config),
+            metrics={},
+            code_version="test",
+            created_at=now,
+        )
+        session.add(second)
+        session.flush()
+        for checkpoint_id in (second.id, start):  # the start once more, which is no rollback
+            publications.publish(
+                session, now, campaign_id=campaign, checkpoint_id=checkpoint_id, reason="", by=None
+            )
+    open_campaign(page, studio, campaign)
+    shown = page.locator(f'[data-checkpoint="{comparison}"]')
+    shown.get_by_text("comparison", exact=True).wait_for()
+    assert shown.get_by_role("button", name="Publish").count() == 0
+    page.get_by_role("button", name="Roll back").click()
+    confirm(page, "Roll back")
+    page.locator(f'[data-checkpoint="{second.id}"]').get_by_text("published").wait_for()
+    page.get_by_role("button", name="Roll back").click()
+    confirm(page, "Roll back")
+    page.locator("#rollback:disabled").wait_for()
+
+
+def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    name = studio.new_name("renamed")
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("Name", exact=True).fill(name)
+    page.get_by_label("Campaign", exact=True).select_option("archived")
+    confirm(page, "Save")
+    page.get_by_role("heading", name=name).wait_for()
+    page.locator("#archived").get_by_text("archived").wait_for()
+    page.goto(f"{studio.url}/admin")
+    page.locator("#people tr").first.wait_for()
+    assert page.get_by_role("heading", name=name).count() == 0
+    page.get_by_label("Show archived").check()
+    page.get_by_role("heading", name=name).click()
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("Campaign", exact=True).select_option("in use")
+    confirm(page, "Save")
+    page.locator("#archived").wait_for(state="hidden")
+    with studio.database.read() as session:
+        row = session.get_one(Campaign, campaign)
+    assert (row.name, row.archived) == (name, False)

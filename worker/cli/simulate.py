@@ -173,7 +173,7 @@ class TrueChoices:
 def annotator_tokens(admin: Client, config: SimulationConfig) -> Iterator[list[str]]:
     """A bearer token for each simulated annotator, revoked afterwards; accounts are made when they
     do not exist."""
-    accounts = {account["name"]: account for account in admin.get("/annotators")}
+    accounts = {account["name"]: account for account in admin.pages("/annotators")}
     issued = []
     try:
         for number in range(1, config.annotators + 1):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from rodif_core.errors import LearningError
 from rodif_core.finetune import FinetuneResult, finetune
@@ -24,10 +24,10 @@ from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.spec import FinetuneConfig
 from rodif_core.trajectory import Trajectory
 from server import rounds
-from server.states import Choice, JobKind, RoundState
+from server.states import DECISIVE, Choice, JobKind, RoundState
 from server.store import jobs
 from server.store.labels import snapshot_labels
-from server.store.tables import Checkpoint, Episode, Pair, Round
+from server.store.tables import Checkpoint, Episode, Label, Pair, Round
 from worker.attempt import Attempt
 
 WORKSPACE = "round-{}"  # name of the folder of partial results, by round id
@@ -65,10 +65,11 @@ def run(attempt: Attempt) -> None:
     """Do the job, or what is left of it."""
     round_id = attempt.facts.round_id
     assert round_id is not None
-    with attempt.step() as session:
-        rounds.move(session, attempt.bench.clock(), round_id, RoundState.FINETUNING)
+    with attempt.bench.database.read() as session:  # long reads: no writer waits for them
         lesson = read_lesson(session, round_id)
         remove_old_workspaces(session, attempt)
+    with attempt.step() as session:
+        rounds.move(session, attempt.bench.clock(), round_id, RoundState.FINETUNING)
     attempt.progress("noise", 0.0)
     noise, config = choose_conservativeness(lesson)
     with attempt.step() as session:
@@ -105,15 +106,23 @@ def read_lesson(session: Session, round_id: int) -> Lesson:
     Raises LearningError when no label says which episode is better.
     """
     this = session.get_one(Round, round_id)
-    labels = snapshot_labels(session, this.snapshot_digest)
+    labels = snapshot_labels(
+        session,
+        this.snapshot_digest,
+        Label.choice,
+        Label.pair_id,
+        Label.annotator_id,
+        Label.left_episode_id,
+    )
     wanted = [label for label in labels if label.choice in CHOICES]
-    if not any(label.choice in (Choice.FIRST, Choice.SECOND) for label in wanted):
+    if not any(label.choice in DECISIVE for label in wanted):
         raise LearningError(
             f"round {round_id} has {len(labels)} labels, but none says which episode is better"
         )
-    pairs = _by_id(session, Pair, {label.pair_id for label in wanted})
+    ends = (Pair.first_episode_id, Pair.second_episode_id)
+    pairs = _by_id(session, Pair.id, {label.pair_id for label in wanted}, *ends)
     used = {e for p in pairs.values() for e in (p.first_episode_id, p.second_episode_id)}
-    episodes = _by_id(session, Episode, used)
+    episodes = _by_id(session, Episode.id, used, Episode.artifact_sha256)
     index = {episode_id: i for i, episode_id in enumerate(sorted(episodes))}
     comparisons = tuple(
         Comparison(
@@ -133,13 +142,18 @@ def read_lesson(session: Session, round_id: int) -> Lesson:
     )
 
 
-def _by_id(session: Session, table: Any, ids: set[int]) -> dict[int, Any]:
-    """Rows of one table, in portions below the engines' parameter limits."""
-    wanted, rows = sorted(ids), {}
+def _by_id(
+    session: Session,
+    key: InstrumentedAttribute[int],
+    ids: set[int],
+    *columns: InstrumentedAttribute[Any],
+) -> dict[int, Any]:
+    """Columns of one table by id, in portions below the engines' parameter limits."""
+    wanted = sorted(ids)
+    rows: dict[int, Any] = {}
     for start in range(0, len(wanted), 500):
-        portion = wanted[start : start + 500]
-        for row in session.scalars(select(table).where(table.id.in_(portion))):
-            rows[row.id] = row
+        portion = select(key, *columns).where(key.in_(wanted[start : start + 500]))
+        rows |= {row.id: row for row in session.execute(portion)}
     return rows
 
 

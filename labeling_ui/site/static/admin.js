@@ -6,10 +6,11 @@ import { count, words } from "./format.js";
 import { addPerson, drawPeople } from "./people.js";
 
 const box = find("#campaigns");
+const archived = find("#archived");
 
 async function load() {
   try {
-    const campaigns = await get("/campaigns");
+    const campaigns = await get(`/campaigns?archived=${archived.checked}`);
     const cards = await Promise.all(campaigns.map(card));
     replace(box, cards.length > 0 ? cards : nothing());
     await drawPeople();
@@ -31,7 +32,8 @@ async function card(campaign) {
   const fact = (value, name) => element("span", {}, element("b", {}, count(value)), ` ${name}`);
   return element(
     "a.card.campaign-card", { href: `/admin/campaigns/${campaign.id}` },
-    element("div.live-head", {}, element("h2", {}, campaign.name), element("span.pill", {}, words(campaign.task))),
+    element("div.live-head", {}, element("h2", {}, campaign.name), element("span.pill", {}, words(campaign.task)),
+      campaign.archived ? element("span.pill.warn", {}, "archived") : null),
     element("p.muted", {}, campaign.criterion),
     element(
       "div.facts", {},
@@ -73,6 +75,7 @@ async function create() {
   if (values) location.assign(`/admin/campaigns/${made.campaign.id}`);
 }
 
+archived.addEventListener("change", load);
 find("#new-campaign").addEventListener("click", create);
 find("#new-person").addEventListener("click", addPerson);
 load();

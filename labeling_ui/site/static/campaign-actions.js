@@ -13,6 +13,7 @@ const METHODS = [
 const RULES = [
   ["auto", "Publish when the gate passes"], ["manual", "Wait for an admin"], ["never", "Comparison only"],
 ];
+const ARCHIVED = [["false", "in use"], ["true", "archived"]];
 const REASON = { name: "reason", label: "Reason", value: "", placeholder: "kept in the audit trail" };
 
 // `data` is the page's own object: {campaign, stats, checkpoints, …}, kept up to date by the page.
@@ -65,6 +66,7 @@ export function campaignActions(id, data, refresh) {
       title: "Settings",
       confirm: "Save",
       fields: [
+        { name: "name", label: "Name", value: data.campaign.name, required: true },
         { name: "criterion", label: "What annotators are asked", kind: "textarea", value: data.campaign.criterion, required: true },
         { name: "labels_per_pair", label: "Labels per pair", kind: "number", value: now.labels_per_pair, min: 1, max: 20, step: 1, required: true, hint: "Two or more let the noise be measured from overlap." },
         { name: "round_after_labels", label: "Start a round by itself after this many new labels", kind: "number", value: now.round_after_labels, min: 0, step: 1, required: true, hint: "0: only by hand." },
@@ -72,14 +74,19 @@ export function campaignActions(id, data, refresh) {
         { name: "method", label: "Method", kind: "select", value: now.method, options: METHODS },
         { name: "publish_rule", label: "Publishing", kind: "select", value: now.publish_rule, options: RULES },
         { name: "evaluation_episodes", label: "Evaluation runs", kind: "number", value: now.evaluation_episodes, min: 10, max: 10000, step: 1, required: true },
+        { name: "archived", label: "Campaign", kind: "select", value: String(data.campaign.archived), options: ARCHIVED, hint: "An archived campaign hands out no pairs and starts no rounds; nothing is deleted." },
       ],
-      onSubmit: ({ criterion, ...changed }) =>
-        request("PATCH", `/campaigns/${id}`, { body: { criterion, settings: changed } }),
+      onSubmit: ({ name, criterion, archived, ...changed }) => {
+        const now = { name: data.campaign.name, archived: String(data.campaign.archived) };
+        const renamed = name === now.name ? {} : { name };
+        const moved = archived === now.archived ? {} : { archived: archived === "true" };
+        return request("PATCH", `/campaigns/${id}`, { body: { criterion, settings: changed, ...renamed, ...moved } });
+      },
     });
   };
 
   const publish = (checkpointId) => {
-    const { name } = data.checkpoints.find((item) => item.id === checkpointId);
+    const { name } = data.checkpoints.find((item) => item.id === checkpointId) ?? { name: `Checkpoint ${checkpointId}` };
     return confirmed(`${name} is published.`, {
       title: `Publish ${name}?`,
       text: "From now on runs are collected from it, and rounds start from it. It can be rolled back.",
@@ -100,7 +107,7 @@ export function campaignActions(id, data, refresh) {
 
   const cancel = (round) => confirmed(`Round ${round.id} is cancelled.`, {
     title: `Cancel round ${round.id}?`,
-    text: "The labels stay; a round can be started from them again.",
+    text: "The labels stay, and count as new again.",
     confirm: "Cancel round",
     danger: true,
     onSubmit: () => post(`/rounds/${round.id}/cancel`),

@@ -1,61 +1,51 @@
-// The campaign page: fetches everything, follows the server's events, and wires the buttons.
+// The campaign page: draws what there is, follows the server's events, and wires the buttons.
 
 import { ApiError, get, signInAddress } from "./api.js";
 import { gate, legend, measures, pathMap } from "./behaviour.js";
 import { campaignActions } from "./campaign-actions.js";
+import { campaignData, PARTS } from "./campaign-data.js";
 import { drawCurves } from "./curves.js";
 import { describe, element, find, replace } from "./dom.js";
-import { isRunning, liveCollect, liveRound, showProgress } from "./live.js";
+import { isRunning, liveCollect, liveRound, liveWords, showProgress } from "./live.js";
 import * as panels from "./panels.js";
+import { renew } from "./steady.js";
 
 const id = document.body.dataset.campaignId;
 const REFRESH_MS = 900; // at most this often, however fast events come
 const IDLE_REFRESH_MS = 15_000; // should the event stream be cut by a proxy
-const PAIRS_AT_ONCE = 24;
-const JOBS_AT_ONCE = 20; // of each of these states:
-const JOB_STATES = ["failed", "running", "queued"];
+const STREAM_PATIENCE_MS = 1000; // then the page is drawn without waiting for the stream
 
-const data = { campaign: null, stats: null, rounds: [], jobs: [], checkpoints: [], pairs: [], pairCursor: null };
+const { data, load, loadMore, changedBy, events } = campaignData(id);
 let chosenRound = null; // id; null follows the newest with a result
 let drawnCurves = "";
+const whole = { key: "", round: null }; // the shown round with the paths of its evaluations
 const actions = campaignActions(id, data, () => refresh());
 
 // ---- loading ---------------------------------------------------------------------------------
 
-async function load() {
-  const [campaign, stats, rounds, pairs, ...jobs] = await Promise.all([
-    get(`/campaigns/${id}`), get(`/campaigns/${id}/stats`), get(`/campaigns/${id}/rounds`),
-    get(`/campaigns/${id}/pairs?limit=${PAIRS_AT_ONCE}`),
-    ...JOB_STATES.map((state) => get(`/jobs?campaign_id=${id}&state=${state}&limit=${JOBS_AT_ONCE}`)),
-  ]);
-  const checkpoints = await get(`/checkpoints?task=${encodeURIComponent(campaign.task)}`);
-  Object.assign(data, { campaign, stats, rounds, jobs: jobs.flat(), checkpoints });
-  if (data.pairs.length <= PAIRS_AT_ONCE) Object.assign(data, { pairs: pairs.items, pairCursor: pairs.next_cursor });
-  draw();
-}
+const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+const wanted = new Set();
+let refreshing = false;
 
-let refreshing = null;
-let again = false;
-
-// Calls that come while it runs lead to one more run.
-async function refresh() {
-  if (refreshing) {
-    again = true;
-    return;
+// Without names: all parts. Calls that come while it runs lead to one more run.
+async function refresh(...parts) {
+  for (const part of parts.length > 0 ? parts : PARTS) wanted.add(part);
+  if (refreshing) return;
+  refreshing = true;
+  while (wanted.size > 0) {
+    const now = [...wanted];
+    wanted.clear();
+    try {
+      await load(now);
+      draw();
+      await drawShownRound(now.includes("curves"));
+      find("#banner").hidden = true;
+    } catch (error) {
+      complain(error);
+    }
+    await pause(REFRESH_MS);
   }
-  refreshing = load();
-  try {
-    await refreshing;
-    find("#banner").hidden = true;
-  } catch (error) {
-    complain(error);
-  }
-  await new Promise((resolve) => setTimeout(resolve, REFRESH_MS));
-  refreshing = null;
-  if (again) {
-    again = false;
-    refresh();
-  }
+  refreshing = false;
 }
 
 function complain(error) {
@@ -64,18 +54,23 @@ function complain(error) {
     return;
   }
   const banner = find("#banner");
-  replace(banner, element("span", {}, describe(error)), element("button.link", { type: "button", onclick: refresh }, "Try again"));
+  renew(banner, element("span", {}, describe(error)), element("button.link", { type: "button", onclick: () => refresh() }, "Try again"));
   banner.hidden = false;
 }
 
+// Resolves when the stream is open: what happens from then on is told, so everything is fetched after it.
 function follow() {
-  const stream = new EventSource(`/api/v1/campaigns/${id}/events`);
-  for (const name of ["progress", "state", "curve", "label", "publication"]) {
+  const stream = new EventSource(`/api/v1/campaigns/${id}/events?after=now`);
+  for (const name of events) {
     stream.addEventListener(name, (event) => {
-      if (name === "progress") showProgress(JSON.parse(event.data));
-      refresh();
+      const told = JSON.parse(event.data);
+      const parts = changedBy(name, told);
+      if (name === "progress") showProgress(told);
+      if (parts.length > 0) refresh(...parts);
     });
   }
+  const opened = new Promise((resolve) => { stream.addEventListener("open", resolve, { once: true }); });
+  return Promise.race([opened, pause(STREAM_PATIENCE_MS)]);
 }
 
 // ---- drawing ---------------------------------------------------------------------------------
@@ -94,9 +89,7 @@ function evaluationOf(checkpoint) {
   return [metrics.evaluation, metrics.measured, metrics].find((item) => typeof item?.success === "number") ?? null;
 }
 
-const roundOf = (checkpoint) => data.rounds.find((round) => round.id === checkpoint.round_id);
-const isComparison = (checkpoint) => roundOf(checkpoint)?.publish_rule === "never";
-const taskFacts = () => data.checkpoints.find((item) => item.id === publishedId())?.config.task_facts;
+const taskFacts = () => data.published?.config.task_facts;
 
 // The newest round that says something about the published line; comparison rounds come after.
 function shownRound() {
@@ -106,50 +99,45 @@ function shownRound() {
 }
 
 function draw() {
-  const published = data.checkpoints.find((item) => item.id === publishedId());
-  find("#published").textContent = published ? `Published policy: ${published.name}` : "";
-  find(".criterion-text").textContent = `“${data.campaign.criterion}”`;
-  find("#rollback").disabled = publishedId() === data.campaign.start_checkpoint_id;
-  replace(find("#tiles"), panels.tiles(data.stats, published ? evaluationOf(published) : null));
-  replace(find("#annotators"), panels.annotatorTable(data.stats.annotators));
+  if (!data.stats || !data.published) return;
+  const { campaign, stats, published } = data;
+  find("h1").textContent = campaign.name;
+  find("#archived").hidden = !campaign.archived;
+  find("#published").textContent = `Published policy: ${published.name}`;
+  find(".criterion-text").textContent = `“${campaign.criterion}”`;
+  find("#rollback").disabled = stats.rollback_checkpoint_id === null;
+  renew(find("#tiles"), panels.tiles(stats, evaluationOf(published)));
+  renew(find("#annotators"), panels.annotatorTable(stats.annotators));
   const noisy = shownRound()?.noise ? shownRound() : data.rounds.find((round) => round.noise);
-  replace(find("#answers"), panels.answerBars(data.stats.labels), panels.noiseText(noisy));
-  replace(find("#rounds"), panels.roundTable(data.rounds, shownRound()?.id, {
+  renew(find("#answers"), panels.answerBars(stats.labels), panels.noiseText(noisy));
+  renew(find("#rounds"), panels.roundTable(data.rounds, shownRound()?.id, {
     onSelect: select, onPublish: actions.publish, publishedId: publishedId(),
   }));
-  replace(find("#checkpoints"), panels.checkpointTable(data.checkpoints, {
-    publishedId: publishedId(), evaluationOf, isComparison, onLineage: actions.lineage, onPublish: actions.publish,
+  renew(find("#checkpoints"), panels.checkpointTable(data.checkpoints, {
+    publishedId: publishedId(), evaluationOf, onLineage: actions.lineage, onPublish: actions.publish,
   }));
+  for (const name of ["rounds", "checkpoints"]) find(`#more-${name}`).hidden = data.cursors[name] === null;
   drawPairs();
   drawJobs();
   drawLive();
-  drawBehaviour();
-  drawCurvesOf(shownRound());
 }
 
 function drawPairs() {
   const { pairs } = data;
   find("#pairs-note").textContent = pairs.length > 0 ? "as annotators see them: A left, B right" : "";
-  const more = data.pairCursor
-    ? element("div.more-row", {}, element("button.button.small", { type: "button", onclick: morePairs }, "Show more"))
+  const more = data.cursors.pairs
+    ? element("div.more-row", {}, element("button.button.small", { type: "button", onclick: () => showMore("pairs") }, "Show more"))
     : null;
   const nothing = element("div.empty", {}, element("strong", {}, "No pairs yet"), "Collect runs: pairs are chosen among them and made into replays.");
   const box = find("#pairs");
   box.classList.toggle("pair-grid", pairs.length > 0);
-  // Pictures that are there stay, so that their motion does not start anew at every refresh.
-  const shown = box.dataset.shown;
-  const now = JSON.stringify([pairs.map((pair) => [pair.id, pair.thumbnail_url, pair.state]), data.pairCursor]);
-  if (shown === now) return;
-  box.dataset.shown = now;
-  replace(box, pairs.length > 0 ? panels.pairCards(pairs) : nothing, more);
+  renew(box, pairs.length > 0 ? panels.pairCards(pairs) : nothing, more);
 }
 
-async function morePairs() {
+async function showMore(name) {
   try {
-    const page = await get(`/campaigns/${id}/pairs?limit=${PAIRS_AT_ONCE}&cursor=${data.pairCursor}`);
-    data.pairs = [...data.pairs, ...page.items];
-    data.pairCursor = page.next_cursor;
-    drawPairs();
+    await loadMore(name);
+    draw();
   } catch (error) {
     complain(error);
   }
@@ -158,7 +146,7 @@ async function morePairs() {
 function drawJobs() {
   const { queued, running, failed } = data.stats.jobs;
   find("#jobs-note").textContent = `${queued} queued · ${running} running · ${failed} failed`;
-  replace(find("#jobs"), panels.jobTable(data.jobs.slice(0, JOBS_AT_ONCE), { onRetry: actions.retry }));
+  renew(find("#jobs"), panels.jobTable(data.jobs, { onRetry: actions.retry }));
 }
 
 function drawLive() {
@@ -166,29 +154,41 @@ function drawLive() {
   const open = data.jobs.filter((job) => job.state !== "failed");
   const collecting = open.filter((job) => job.kind === "collect");
   const jobOf = (round) => open.find((job) => job.round_id === round.id);
-  replace(
+  renew(
     find("#live"),
     rounds.map((round) => liveRound(round, jobOf(round), () => actions.cancel(round))), collecting.map(liveCollect),
   );
+  renew(find("#live-state"), liveWords(rounds, collecting));
+}
+
+// Paths and curves are large: fetched for the one round that is shown, when there is something new.
+async function drawShownRound(newPoints) {
+  const shown = shownRound();
+  const key = JSON.stringify([shown?.id, shown?.state, Boolean(shown?.result?.before), Boolean(shown?.result?.after)]);
+  const another = key !== whole.key;
+  if (another && shown) whole.round = await get(`/rounds/${shown.id}`);
+  whole.key = key;
+  drawBehaviour();
+  if (another || newPoints) await drawCurvesOf(shown);
 }
 
 function drawBehaviour() {
-  const choice = find("#round-choice");
   const shown = shownRound();
   const measured = data.rounds.filter((round) => round.result?.before);
+  const choice = find("#round-choice");
   choice.parentElement.hidden = measured.length === 0;
   if (document.activeElement !== choice) {
-    replace(choice, measured.map((round) => element(
-      "option", { value: round.id, selected: round.id === shown?.id },
+    renew(choice, measured.map((round) => element(
+      "option", { value: round.id, dataset: { key: round.id } },
       `${round.id} · ${round.config.method}${round.publish_rule === "never" ? " (comparison)" : ""}`,
     )));
+    choice.value = shown?.id ?? "";
   }
   const box = find("#behaviour");
   const facts = taskFacts();
-  const { before, after, gate: verdict } = shown?.result ?? {};
-  const key = JSON.stringify([shown?.id, shown?.state, Boolean(before), Boolean(after)]);
-  if (box.dataset.shown === key) return;
-  box.dataset.shown = key;
+  const { before, after, gate: verdict } = (shown && whole.round?.result) || {};
+  if (box.dataset.shown === whole.key) return;
+  box.dataset.shown = whole.key;
   if (!before || !facts) {
     replace(box, element("div.empty", {}, element("strong", {}, "No round has been evaluated yet"),
       "After a round, this shows what the policy does before and after, with intervals."));
@@ -205,24 +205,25 @@ function drawBehaviour() {
 
 async function drawCurvesOf(round) {
   if (!round) return;
+  const points = await get(`/rounds/${round.id}/curves`);
+  const key = `${round.id}:${points.length}`;
+  if (key === drawnCurves) return;
+  const card = find("#curves-card");
+  const some = points.some((point) => typeof point.loss === "number" || typeof point.mean_vote === "number");
+  card.hidden = !some;
+  find("#curves-note").textContent = `round ${round.id}, ${round.config.method}`;
+  if (some) await drawCurves(points);
+  drawnCurves = key;
+}
+
+async function select(roundId) {
+  chosenRound = roundId;
+  draw();
   try {
-    const points = await get(`/rounds/${round.id}/curves`);
-    const key = `${round.id}:${points.length}`;
-    if (key === drawnCurves) return;
-    const card = find("#curves-card");
-    const some = points.some((point) => typeof point.loss === "number" || typeof point.mean_vote === "number");
-    card.hidden = !some;
-    find("#curves-note").textContent = `round ${round.id}, ${round.config.method}`;
-    if (some) await drawCurves(points);
-    drawnCurves = key;
+    await drawShownRound(false);
   } catch (error) {
     complain(error);
   }
-}
-
-function select(roundId) {
-  chosenRound = roundId;
-  draw();
   find("#behaviour-card").scrollIntoView({ block: "nearest" });
 }
 
@@ -236,6 +237,7 @@ find("#round-choice").addEventListener("change", (event) => {
   event.target.blur();
   select(Number(event.target.value));
 });
-setInterval(refresh, IDLE_REFRESH_MS);
-await refresh();
-follow();
+for (const name of ["rounds", "checkpoints"]) find(`#more-${name} button`).addEventListener("click", () => showMore(name));
+setInterval(() => refresh(), IDLE_REFRESH_MS);
+await follow();
+refresh();

@@ -22,7 +22,7 @@ export function liveRound(round, job, onCancel) {
   const steps = STAGES.map(([, name], index) =>
     element(`li${index < now ? ".past" : index === now ? ".now" : ""}`, {}, name));
   return element(
-    "div.card.live", { dataset: { liveRound: round.id, job: job?.id } },
+    "div.card.live", { dataset: { key: `round ${round.id}`, job: job?.id ?? "" } },
     element(
       "div.live-head", {},
       element("h2", {}, `Round ${round.id} is running`),
@@ -35,9 +35,18 @@ export function liveRound(round, job, onCancel) {
 
 export function liveCollect(job) {
   return element(
-    "div.card.live", { dataset: { job: job.id } },
+    "div.card.live", { dataset: { key: `job ${job.id}`, job: job.id } },
     element("div.live-head", {}, element("h2", {}, "Collecting runs of the published policy")), meter(job),
   );
+}
+
+// What a screen reader is told: only this, and only when it changes.
+export function liveWords(rounds, collecting) {
+  const stage = new Map(STAGES);
+  return [
+    ...rounds.map((round) => `Round ${round.id}: ${stage.get(round.state)}.`),
+    collecting.length > 0 ? "Collecting runs." : null,
+  ].filter(Boolean).join(" ");
 }
 
 // Moves the meter at once; everything else follows with the next refresh.

@@ -51,7 +51,7 @@ export function tiles(stats, evaluation) {
 
 export function annotatorTable(annotators) {
   const rows = annotators.map((person) => element(
-    "tr", {},
+    "tr", { dataset: { key: person.id } },
     cell([person.name, person.kind === "simulated" ? under("simulated") : null]),
     cell(count(person.labels), ".number"),
     cell(duration(person.median_duration_ms), ".number"),
@@ -99,7 +99,7 @@ export function roundTable(rounds, selected, { onSelect, onPublish, publishedId 
     const mayPublish = round.candidate_checkpoint_id && round.publish_rule !== "never"
       && ["kept", "rejected"].includes(round.state) && round.candidate_checkpoint_id !== publishedId;
     return element(
-      `tr${round.id === selected ? ".selected" : ""}`, { dataset: { round: round.id } },
+      `tr${round.id === selected ? ".selected" : ""}`, { dataset: { key: round.id, round: round.id } },
       cell(element("button.link", { type: "button", onclick: () => onSelect(round.id) }, `Round ${round.id}`)),
       cell([pill(round.state), round.error ? under(element("span.error-text", {}, round.error)) : null]),
       cell([round.config.method, under(round.publish_rule === "never" ? "comparison" : words(round.trigger))]),
@@ -118,21 +118,21 @@ export function roundTable(rounds, selected, { onSelect, onPublish, publishedId 
   return table(heads, rows, "No round yet. Collect runs, have them labelled, then start one.");
 }
 
-export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLineage, onPublish, isComparison }) {
+export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLineage, onPublish }) {
   const rows = checkpoints.map((checkpoint) => {
     const evaluation = evaluationOf(checkpoint);
     const rate = (key) => evaluation
       ? [percent(evaluation[key]), under(interval(evaluation.intervals?.[key]))] : "–";
     const published = checkpoint.id === publishedId;
     return element(
-      "tr", { dataset: { checkpoint: checkpoint.id } },
+      "tr", { dataset: { key: checkpoint.id, checkpoint: checkpoint.id } },
       cell([checkpoint.name, under(element("code", {}, short(checkpoint.digest)))]),
-      cell(published ? element("span.pill.good", {}, "published") : isComparison(checkpoint) ? element("span.pill", {}, "comparison") : null),
+      cell(published ? element("span.pill.good", {}, "published") : checkpoint.comparison ? element("span.pill", {}, "comparison") : null),
       cell(rate("success"), ".number"), cell(rate("alignment"), ".number"), cell(rate("off_support"), ".number"),
       cell(ago(checkpoint.created_at), ".tight"),
       cell([
         element("button.button.small", { type: "button", onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
-        published || isComparison(checkpoint) ? null
+        published || checkpoint.comparison ? null
           : element("button.button.small", { type: "button", onclick: () => onPublish(checkpoint.id) }, "Publish"),
       ], ".tight"),
     );
@@ -143,7 +143,7 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
 
 export function jobTable(jobs, { onRetry }) {
   const rows = jobs.map((job) => element(
-    "tr", { dataset: { job: job.id } },
+    "tr", { dataset: { key: job.id, job: job.id } },
     cell(`${words(job.kind)} ${job.id}`),
     cell([pill(job.state), job.error ? under(element("span.error-text", {}, job.error)) : null]),
     cell([job.stage, job.state === "running" ? under(percent(job.progress)) : null]),
@@ -156,7 +156,7 @@ export function jobTable(jobs, { onRetry }) {
 
 export function pairCards(pairs) {
   return pairs.map((pair) => element(
-    "figure.pair", { dataset: { pair: pair.id } },
+    "figure.pair", { dataset: { key: pair.id, pair: pair.id } },
     pair.thumbnail_url
       ? element("img", { src: pair.thumbnail_url, loading: "lazy", alt: `Paths of pair ${pair.id}` })
       : element("div.blank", {}, words(pair.state)),
@@ -168,7 +168,7 @@ export function lineageList(steps) {
   return element(
     "ol.lineage", {},
     steps.map((step) => {
-      const people = step.labels_by_annotator.map((item) => `${item.name} ${item.labels}`).join(", ");
+      const people = step.labels_by_annotator.map((item) => `${item.name} ${count(item.labels)}`).join(", ");
       const method = step.config?.method;
       return element(
         "li", {},
@@ -177,7 +177,7 @@ export function lineageList(steps) {
           ? element("p.muted.small", {}, "pretrained, no labels behind it")
           : element("p.muted.small", {}, `Round ${step.round_id}, ${method}, configuration ${short(step.config_digest)}`),
         step.round_id === null ? null
-          : element("p.muted.small", {}, `${step.label_ids.length} labels (snapshot ${short(step.snapshot_digest)}): ${people}`),
+          : element("p.muted.small", {}, `${count(step.labels)} labels (snapshot ${short(step.snapshot_digest)}): ${people}`),
         element("p.muted.small", {}, `code version ${step.code_version}`),
       );
     }),

@@ -1,7 +1,7 @@
 // The accounts of the studio: who may label, who may administer; new accounts and passwords.
 
-import { get, post, request } from "./api.js";
-import { ask, element, find, replace, toast } from "./dom.js";
+import { getAll, post, request } from "./api.js";
+import { ask, describe, element, find, replace, toast } from "./dom.js";
 import { count } from "./format.js";
 import { table } from "./panels.js";
 import { addToken, drawTokens } from "./tokens.js";
@@ -10,7 +10,7 @@ const ROLES = [["annotator", "Annotator: labels"], ["admin", "Admin: everything"
 const PASSWORD_HINT = "At least 8 characters. Tell it to the person yourself.";
 
 export async function drawPeople() {
-  const people = await get("/annotators");
+  const people = await getAll("/annotators");
   const heads = [["Name"], ["Role"], ["Labels", "number"], [""]];
   replace(find("#people"), table(heads, people.map(row), "Nobody."));
   find("#new-token").onclick = () => addToken(people);
@@ -72,6 +72,11 @@ async function deactivate(person) {
 }
 
 async function activate(person) {
-  await patch(person, { active: true });
-  await drawPeople();
+  try {
+    await patch(person, { active: true });
+    toast(`${person.name} can sign in again.`);
+    await drawPeople();
+  } catch (error) {
+    toast(describe(error), { bad: true, seconds: 12 });
+  }
 }

@@ -1,6 +1,6 @@
 // Tokens for scripts: made for an account, shown once, listed without the secret, revoked.
 
-import { get, post, request } from "./api.js";
+import { getAll, post, request } from "./api.js";
 import { ask, element, find, replace, show, toast } from "./dom.js";
 import { ago, day } from "./format.js";
 import { table } from "./panels.js";
@@ -8,7 +8,7 @@ import { table } from "./panels.js";
 // `people` are all accounts, to name the owner of each token.
 export async function drawTokens(people) {
   const now = Date.now();
-  const tokens = (await get("/tokens")).filter((token) => !token.revoked_at && new Date(token.expires_at).getTime() > now);
+  const tokens = (await getAll("/tokens")).filter((token) => !token.revoked_at && new Date(token.expires_at).getTime() > now);
   const nameOf = new Map(people.map((person) => [person.id, person.name]));
   const heads = [["Token"], ["Account"], ["Last used"], ["Valid until"], [""]];
   const rows = tokens.map((token) => row(token, nameOf.get(token.annotator_id), people));
