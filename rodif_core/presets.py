@@ -168,6 +168,7 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     ("stacking", "cpu"): {
         "images": ImageConfig(),
         "encoder": EncoderConfig(moments=24_000, updates=5_000),
+        "rounds": 4,
     },
     **{
         (task, "paper"): {

@@ -27,7 +27,7 @@ CPU_MINUTES = {
     "sorting": 55,
     "aligning": 30,
     "aligning-state": 9,
-    "stacking": 120,
+    "stacking": 150,
     "stacking-state": 50,
 }
 

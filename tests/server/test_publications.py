@@ -98,8 +98,12 @@ def test_what_cannot_be_published_is_refused_with_the_reason(
         answer = _publish(world, campaign_id, checkpoint_id)
         assert answer.status_code == status and words in answer.json()["detail"]
     assert _published(world, campaign_id) == 1
-    listed = world.client("ada").get("/checkpoints?limit=2").json()
-    assert [(row["id"], row["comparison"]) for row in listed["items"]] == [(5, True), (4, False)]
+    listed = world.client("ada").get("/checkpoints?limit=3").json()
+    assert [(row["id"], row["comparison"]) for row in listed["items"]] == [
+        (6, False),
+        (5, True),
+        (4, False),
+    ]
     assert listed["next_cursor"] == 4
 
 
