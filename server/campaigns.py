@@ -112,14 +112,15 @@ def change_campaign(
 ) -> Campaign:
     """Change what is not None; `settings` are complete and checked.
 
-    Raises NotFoundError; ConflictError for a taken name, or for another criterion once there are
-    labels, because they were given under the old one.
+    A criterion that differs in the white space around it only is no change. Raises NotFoundError;
+    ConflictError for a taken name, or for another criterion once there are labels, because they
+    were given under the old one.
     """
     campaign = session.get(Campaign, campaign_id, with_for_update=LOCK)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     changed: dict[str, Any] = {}
-    if criterion is not None and criterion != campaign.criterion:
+    if criterion is not None and criterion.strip() != campaign.criterion.strip():
         labels = select(Label.id).where(Label.campaign_id == campaign_id).limit(1)
         if session.scalar(labels) is not None:
             raise ConflictError(
