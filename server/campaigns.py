@@ -22,6 +22,7 @@ from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs
 from server.store.events import audit
 from server.store.labels import is_effective
+from server.store.leases import count_reported
 from server.store.pairs import count_by_state
 from server.store.session import LOCK
 from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Job, Label, Pair
@@ -224,6 +225,7 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
                     Label.campaign_id == campaign_id, is_effective()
                 )
             ),
+            "reported": count_reported(session, campaign_id),
         },
         "labels": _label_counts(session, campaign_id),
         "annotators": _annotator_counts(session, campaign_id),

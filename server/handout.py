@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.orm import Session
 
 from server.errors import NotFoundError
 from server.states import PairState
 from server.store.labels import is_effective
+from server.store.leases import pairs_given_back
 from server.store.pairs import (
     count_by_state,
     count_taken,
@@ -20,6 +21,7 @@ from server.store.pairs import (
 )
 from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pair
 
+GIVEN_BACK_FOR = timedelta(hours=12)  # for so long a pair that one gave back stays away
 MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetching
 # Pairs of which labels so far say that people will prefer one side come first, because a click on
 # "equal" teaches less. Every so many of an annotator's pairs comes in turn all the same: what
@@ -111,7 +113,7 @@ def _take_open_pair(
             open_pairs(
                 now, campaign.id, annotator_id, labels_per_pair=wanted, telling_first=telling_first
             )
-            .where(Pair.id.not_in(refused))
+            .where(Pair.id.not_in(refused), _not_given_back(now, annotator_id))
             .limit(1)
             .with_for_update(of=Pair, key_share=True, skip_locked=skip_locked)
         )
@@ -124,6 +126,11 @@ def _take_open_pair(
             return pair
         else:
             refused.append(pair.id)
+
+
+def _not_given_back(now: datetime, annotator_id: int) -> ColumnElement[bool]:
+    """Condition on Pair: what one skipped does not come straight back."""
+    return Pair.id.not_in(pairs_given_back(annotator_id, since=now - GIVEN_BACK_FOR))
 
 
 def _handed_out(session: Session, annotator_id: int) -> int:
@@ -157,7 +164,7 @@ def handout(session: Session, now: datetime, campaign: Campaign, lease: Lease) -
         campaign.id,
         lease.annotator_id,
         labels_per_pair=int(campaign.settings["labels_per_pair"]),
-    )
+    ).where(_not_given_back(now, lease.annotator_id))
     counted = session.execute(
         select(func.count()).select_from(still_open.order_by(None).subquery())
     ).scalar_one()

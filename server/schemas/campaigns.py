@@ -84,12 +84,16 @@ class CollectRequest(In):
 
 
 class PairCounts(Out):
-    """Pairs by state; `labelled` have at least one label in force."""
+    """Pairs by state; `labelled` have at least one label in force.
+
+    `reported`: without one, and an annotator gave them back because the replay does not play.
+    """
 
     ready: int
     waiting: int
     failed: int
     labelled: int
+    reported: int
 
 
 class LabelCounts(Out):

@@ -208,7 +208,7 @@ def test_stats_count_what_is_in_force(world: World) -> None:
     stats = world.client("ada").get(f"/campaigns/{campaign_id}/stats").json()
     assert stats == {
         "episodes": 8,
-        "pairs": {"ready": 3, "waiting": 0, "failed": 1, "labelled": 2},
+        "pairs": {"ready": 3, "waiting": 0, "failed": 1, "labelled": 2, "reported": 0},
         "labels": {
             "total": 6,
             "effective": 3,
