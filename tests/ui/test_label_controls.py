@@ -49,6 +49,8 @@ def test_arrows_on_help_and_on_the_notes_undo_do_not_judge(
     driver.press("ArrowLeft")
     studio.wait_for_labels(driver.campaign_id, 1)
     driver.wait_ready()
+    # The note may be gone by now, on a busy machine.
+    driver.page.evaluate("document.querySelector('#toast').hidden = false")
     driver.page.locator("#toast").get_by_role("button", name="Undo").focus()
     driver.press("ArrowDown")
     driver.page.wait_for_timeout(300)

@@ -128,21 +128,23 @@ def test_open_page_of_one_person_labels_nothing_under_the_next_ones_session(
     assert (others.choice, own.choice) == (Choice.FIRST, Choice.SECOND)
 
 
+def _name_another_lease(route: Route) -> None:
+    """The server will say that the pair was never handed out under this one."""
+    body = json.loads(route.request.post_data or "")
+    route.continue_(post_data=json.dumps(body | {"lease_id": 2**31 - 1}))
+
+
 def test_what_the_server_does_not_accept_is_shown_kept_and_sent_again_on_request(
     studio: Studio, label_page: Opened, page: Page
 ) -> None:
-    campaign = studio.add_campaign([True, True])
+    studio.add_campaign()  # a second one: the choice of campaigns stays on the screen
+    campaign = studio.add_campaign([True])
     driver = label_page(campaign)
-
-    def name_another_lease(route: Route) -> None:
-        body = json.loads(route.request.post_data or "")
-        route.continue_(post_data=json.dumps(body | {"lease_id": 2**31 - 1}))
-
-    page.route(LABELS, name_another_lease)
+    page.route(LABELS, _name_another_lease)
     driver.press("ArrowLeft")
     page.get_by_text("1 answer was not accepted.").wait_for()
     page.unroute(LABELS)
-    driver.reload()
+    page.goto(f"{studio.url}/label")
     page.get_by_role("button", name="Show", exact=True).click()
     sheet = page.get_by_role("dialog", name="Not accepted")
     assert "A is better" in sheet.inner_text() and "was never handed to you" in sheet.inner_text()
@@ -156,23 +158,21 @@ def test_what_the_server_does_not_accept_is_shown_kept_and_sent_again_on_request
 def test_answer_that_is_not_accepted_does_not_hold_up_the_next_one_and_can_be_discarded(
     studio: Studio, label_page: Opened, page: Page
 ) -> None:
+    studio.add_campaign()
     campaign = studio.add_campaign([True, False])
     driver = label_page(campaign)
-    gone = {"title": "Not Found", "status": 404, "detail": "no pair"}
-    page.route(
-        LABELS,
-        lambda route: route.fulfill(status=404, content_type=PROBLEM, body=json.dumps(gone)),
-        times=1,
-    )
+    page.route(LABELS, _name_another_lease, times=1)
     driver.press("ArrowLeft")
     page.get_by_text("1 answer was not accepted.").wait_for()
-    driver.wait_ready()
+    shown = driver.wait_ready()
     driver.press("ArrowLeft")
-    studio.wait_for_labels(campaign, 1)
+    (row,) = studio.wait_for_labels(campaign, 1)
+    assert row.pair_id == shown
+    page.goto(f"{studio.url}/label")
     page.get_by_role("button", name="Show", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Discard").click()
     page.locator("#outbox-refused").wait_for(state="hidden")
-    until(page, f"{STORED} === 0")
+    assert page.evaluate(STORED) == 0
 
 
 def test_page_says_that_the_browser_cannot_keep_an_answer(

@@ -38,7 +38,8 @@ function tellWaiting(banner, { waiting, unkept, trouble }) {
 function tellRefused(banner, outbox) {
   const count = outbox.refused.length;
   banner.hidden = count === 0;
-  if (banner.hidden) return;
+  if (banner.hidden || banner.dataset.count === String(count)) return; // a click is perhaps on its way
+  banner.dataset.count = count;
   replace(
     banner, element("span", {}, `${answers(count, "was", "were")} not accepted.`),
     button("Show", () => showRefused(outbox)),
