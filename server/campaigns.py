@@ -22,6 +22,7 @@ from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs
 from server.store.events import audit
 from server.store.labels import is_effective
+from server.store.leases import count_reported
 from server.store.pairs import count_by_state
 from server.store.session import LOCK
 from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Job, Label, Pair
@@ -112,14 +113,15 @@ def change_campaign(
 ) -> Campaign:
     """Change what is not None; `settings` are complete and checked.
 
-    Raises NotFoundError; ConflictError for a taken name, or for another criterion once there are
-    labels, because they were given under the old one.
+    A criterion that differs in the white space around it only is no change. Raises NotFoundError;
+    ConflictError for a taken name, or for another criterion once there are labels, because they
+    were given under the old one.
     """
     campaign = session.get(Campaign, campaign_id, with_for_update=LOCK)
     if campaign is None:
         raise NotFoundError("campaign", campaign_id)
     changed: dict[str, Any] = {}
-    if criterion is not None and criterion != campaign.criterion:
+    if criterion is not None and criterion.strip() != campaign.criterion.strip():
         labels = select(Label.id).where(Label.campaign_id == campaign_id).limit(1)
         if session.scalar(labels) is not None:
             raise ConflictError(
@@ -224,6 +226,7 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
                     Label.campaign_id == campaign_id, is_effective()
                 )
             ),
+            "reported": count_reported(session, campaign_id),
         },
         "labels": _label_counts(session, campaign_id, answers),
         "annotators": _annotator_counts(session, campaign_id, answers),

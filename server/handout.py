@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import ColumnElement, Select, func, select
 from sqlalchemy.orm import Session
 
 from server.errors import NotFoundError
 from server.states import PairState
 from server.store.labels import is_effective
+from server.store.leases import pairs_given_back
 from server.store.pairs import (
     count_by_state,
     count_taken,
@@ -23,6 +24,7 @@ from server.store.pairs import (
 from server.store.session import LOCK
 from server.store.tables import Campaign, Checkpoint, Episode, Label, Lease, Pair
 
+GIVEN_BACK_FOR = timedelta(hours=12)  # for so long a pair that one gave back stays away
 MAX_HOLD = 5  # leases that one annotator can hold in a campaign, for prefetching
 # Pairs of which labels so far say that people will prefer one side come first, because a click on
 # "equal" teaches less. Every so many of an annotator's pairs comes in turn all the same: what
@@ -152,7 +154,10 @@ def _take_foreseen_pair(
     """Lock the first pair of the outlook that is still what it was; None when none is."""
     if outlook is None or outlook.handed_out != _handed_out(session, annotator_id):
         return None
+    given_back = set(session.scalars(pairs_given_back(annotator_id, since=now - GIVEN_BACK_FOR)))
     for pair_id, taken in outlook.pairs:
+        if pair_id in given_back:
+            continue
         pair: Pair | None = session.get(
             Pair, pair_id, with_for_update=LOCK | {"skip_locked": True}, populate_existing=True
         )
@@ -202,13 +207,19 @@ def _open_for(
 
     `handed_out`: how many leases the annotator ever had; None when the order does not matter.
     """
-    return open_pairs(
+    pairs = open_pairs(
         now,
         campaign.id,
         annotator_id,
         labels_per_pair=int(campaign.settings["labels_per_pair"]),
         telling_first=handed_out is not None and handed_out % IN_TURN != 0,
     )
+    return pairs.where(_not_given_back(now, annotator_id))
+
+
+def _not_given_back(now: datetime, annotator_id: int) -> ColumnElement[bool]:
+    """Condition on Pair: what one skipped does not come straight back."""
+    return Pair.id.not_in(pairs_given_back(annotator_id, since=now - GIVEN_BACK_FOR))
 
 
 def _handed_out(session: Session, annotator_id: int) -> int:

@@ -50,6 +50,15 @@ class Submission:
         return _digest({"kind": "label", **asdict(self)})
 
 
+@dataclass(frozen=True)
+class Undone:
+    """The row that takes a label back, if it is new, and the pair again (None: judged anew)."""
+
+    retraction: Label
+    again: Handout | None
+    created: bool
+
+
 def _digest(content: dict[str, Any]) -> str:
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -114,9 +123,11 @@ def undo_label(
     *,
     idempotency_key: str,
     lease_for: timedelta,
-) -> tuple[Label, Handout]:
+) -> Undone:
     """Take back an own label by a new row, and hand the same pair out again.
 
+    The same key gives back the first row; the pair comes with it only while that row is the
+    annotator's last word on it, because a pair that was judged anew must not be handed out.
     Raises NotFoundError, NotAllowedError for somebody else's label, ConflictError when the label
     is superseded or taken back already, or when the key was used for another request.
     """
@@ -128,25 +139,31 @@ def undo_label(
     pair = _locked_pair(session, target.pair_id)
     campaign = session.get_one(Campaign, target.campaign_id)
     request = _digest({"kind": "undo", "label_id": label_id})
+    newest = newest_label(session, pair.id, me.id)
     retraction = _by_key(session, me.id, idempotency_key, request)
-    if retraction is None:
-        newest = newest_label(session, pair.id, me.id)
+    if created := retraction is None:
         if newest is None or newest.id != target.id or target.retracted:
             raise ConflictError(
                 f"label {label_id} is not in force: it was superseded or taken back;"
                 f" the last row on pair {pair.id} is {newest.id if newest else None}"
             )
-        lease = session.get(Lease, target.lease_id) if target.lease_id is not None else None
-        row = _label_row(session, now, me, pair, lease)
-        row.choice, row.retracted, row.supersedes_id = target.choice, True, target.id
-        row.late, row.ui_version = False, target.ui_version
+        row = _retraction_row(session, now, me, pair, target)
         row.idempotency_key, row.request_sha256 = idempotency_key, request
         retraction, created = _insert(session, row)
         if created:
             _tell(session, now, retraction)
-    return retraction, handout(
-        session, campaign, _live_or_new_lease(session, now, pair.id, me.id, lease_for)
-    )
+    elif newest is None or newest.id != retraction.id:
+        return Undone(retraction, None, created=False)
+    lease = _live_or_new_lease(session, now, pair.id, me.id, lease_for)
+    return Undone(retraction, handout(session, campaign, lease), created=created)
+
+
+def _retraction_row(session: Session, now: datetime, me: Me, pair: Pair, target: Label) -> Label:
+    lease = session.get(Lease, target.lease_id) if target.lease_id is not None else None
+    row = _label_row(session, now, me, pair, lease)
+    row.choice, row.retracted, row.supersedes_id = target.choice, True, target.id
+    row.late, row.ui_version = False, target.ui_version
+    return row
 
 
 def _locked_pair(session: Session, pair_id: int) -> Pair:

@@ -40,6 +40,13 @@ class PairState(StrEnum):
     FAILED = "failed"  # the replay could not be made
 
 
+class ReleaseReason(StrEnum):
+    """Why an annotator gives a leased pair back without a label."""
+
+    REPLAY_FAILED = "replay_failed"  # the replay does not load or does not start
+    SKIPPED = "skipped"  # anything else
+
+
 class JobKind(StrEnum):
     """Units of queued work."""
 

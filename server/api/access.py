@@ -10,6 +10,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 from sqlalchemy.orm import Session
 
 from server import sign_in
+from server.api.params import ExpectedAnnotator
 from server.api.services import Services, services_of
 from server.errors import NotAllowedError, NotSignedInError
 from server.sign_in import Me
@@ -43,9 +44,20 @@ def current(
     services: UseServices,
     bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
     cookie: Annotated[str | None, Depends(_cookie)],
+    expected: ExpectedAnnotator = None,
 ) -> Me:
-    """Any signed-in account."""
-    return who(services, token=bearer.credentials if bearer else None, cookie=cookie)
+    """Any signed-in account; the one that the sender means, if it says so.
+
+    A page stays open while the session of its browser ends and somebody else signs in: what it
+    sends then must not be stored under that person's name.
+    """
+    me = who(services, token=bearer.credentials if bearer else None, cookie=cookie)
+    if expected is not None and expected != me.id:
+        raise NotSignedInError(
+            f"this request is meant for annotator {expected}, but annotator {me.id} is signed in;"
+            f" sign in as annotator {expected}"
+        )
+    return me
 
 
 def _require(*roles: Role) -> Callable[[Me], Me]:

@@ -158,16 +158,21 @@ def submit_label(
     return _label_out(label, first_is_left=pair.first_is_left)
 
 
-@router.post("/labels/{label_id}/undo", status_code=status.HTTP_201_CREATED)
+@router.post(
+    "/labels/{label_id}/undo",
+    status_code=status.HTTP_201_CREATED,
+    responses={200: {"model": UndoOut, "description": "taken back before under this key"}},
+)
 def undo_label(
     label_id: PathId,
     key: IdempotencyKey,
     me: Anyone,
     session: WriteSession,
     services: UseServices,
+    response: Response,
 ) -> UndoOut:
     """Take an own label back and get the same pair again."""
-    label, again = labeling.undo_label(
+    undone = labeling.undo_label(
         session,
         services.clock(),
         me,
@@ -175,8 +180,12 @@ def undo_label(
         idempotency_key=key,
         lease_for=services.lease_for,
     )
-    shown = _label_out(label, first_is_left=again.pair.first_is_left)
-    return UndoOut(label=shown, next=_next_out(session, services.clock(), again))
+    response.status_code = status.HTTP_201_CREATED if undone.created else status.HTTP_200_OK
+    pair = session.get_one(Pair, undone.retraction.pair_id)
+    return UndoOut(
+        label=_label_out(undone.retraction, first_is_left=pair.first_is_left),
+        next=None if undone.again is None else _next_out(session, services.clock(), undone.again),
+    )
 
 
 @router.get("/campaigns/{campaign_id}/labels")

@@ -24,6 +24,15 @@ IdempotencyKey = Annotated[
         description="made by the client for each answer, such as a UUID",
     ),
 ]
+ExpectedAnnotator = Annotated[
+    int | None,
+    Header(
+        alias="X-Annotator-Id",
+        ge=1,
+        le=MAX_ID,
+        description="the account that the sender means to act for; 401 under another one's session",
+    ),
+]
 LastEventId = Annotated[int | None, Header(alias="Last-Event-ID", ge=0, le=MAX_ID)]
 EventsAfter = Annotated[
     Annotated[int, Field(ge=0, le=MAX_ID)] | Literal["now"],

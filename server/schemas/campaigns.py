@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from rodif_core.spec import FinetuneMethod
-from server.schemas.common import MAX_SEED, Id, In, LongText, Name, Out, ShortText
+from server.schemas.common import MAX_SEED, Criterion, Id, In, LongText, Name, Out, ShortText
 from server.states import AnnotatorKind, PairStrategy, PublishRule
 
 Episodes = Annotated[int, Field(ge=2, le=5000)]
@@ -45,7 +45,7 @@ class CampaignCreate(In):
 
     name: Name
     task: ShortText
-    criterion: Annotated[LongText, Field(min_length=1)] | None = None
+    criterion: Criterion | None = None
     start_checkpoint_id: Id | None = None
     settings: CampaignSettings = CampaignSettings()
 
@@ -54,7 +54,7 @@ class CampaignPatch(In):
     """What to change; `settings` may be partial."""
 
     name: Name | None = None
-    criterion: Annotated[LongText, Field(min_length=1)] | None = None
+    criterion: Criterion | None = None
     settings: dict[str, Any] | None = None
     archived: bool | None = None
 
@@ -89,12 +89,16 @@ class CollectRequest(In):
 
 
 class PairCounts(Out):
-    """Pairs by state; `labelled` have at least one label in force."""
+    """Pairs by state; `labelled` have at least one label in force.
+
+    `reported`: without one, and an annotator gave them back because the replay does not play.
+    """
 
     ready: int
     waiting: int
     failed: int
     labelled: int
+    reported: int
 
 
 class LabelCounts(Out):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Generic, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 MAX_ID = 2**31 - 1  # the integer columns of PostgreSQL
 MAX_SEED = 2**62 - 1
@@ -40,6 +40,12 @@ JsonItem = Annotated[Any, AfterValidator(_storable_json)]
 ShortText = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_storable)]
 Name = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_storable)]
 LongText = Annotated[str, Field(max_length=10_000), AfterValidator(_storable)]
+# What annotators read: white space around it says nothing, and forms add and take it away.
+Criterion = Annotated[
+    str,
+    StringConstraints(strip_whitespace=True, min_length=1, max_length=10_000),
+    AfterValidator(_storable),
+]
 Id = Annotated[int, Field(ge=1, le=MAX_ID)]
 
 

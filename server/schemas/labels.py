@@ -88,10 +88,13 @@ class LabelOut(Out):
 
 
 class UndoOut(Out):
-    """The row that takes the label back, and the same pair again."""
+    """The row that takes the label back, and the same pair again.
+
+    `next` is null when a repeated request comes after the pair has been judged anew.
+    """
 
     label: LabelOut
-    next: NextOut
+    next: NextOut | None
 
 
 class RawLabel(Out):

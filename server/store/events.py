@@ -17,6 +17,7 @@ STREAM_NAMES = {
     "round": "state",
     "curve": "curve",
     "label": "label",
+    "release": "release",
     "publication": "publication",
 }
 

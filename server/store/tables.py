@@ -238,7 +238,7 @@ class Lease(Base):
     annotator_id: Mapped[int] = mapped_column(ForeignKey("annotator.id"))
     issued_at: Mapped[datetime]
     expires_at: Mapped[datetime]
-    closed_at: Mapped[datetime | None]  # labelled or given back
+    closed_at: Mapped[datetime | None]  # labelled, or given back: then it is expires_at
 
 
 class Label(Base):
@@ -361,7 +361,7 @@ class Job(Base):
 class Event(Base):
     """Append-only progress of jobs and rounds, streamed to browsers (server-sent events).
 
-    kind: job | round | curve | label | publication; `data` is what the page draws.
+    kind: job | round | curve | label | release | publication; `data` is what the page draws.
     """
 
     __tablename__ = "event"

@@ -133,6 +133,20 @@ def test_the_criterion_cannot_change_under_given_labels(world: World) -> None:
     assert answer.status_code == 409 and "start a new campaign" in answer.json()["detail"]
 
 
+def test_white_space_around_a_criterion_is_neither_stored_nor_a_change(world: World) -> None:
+    campaign_id, (pair_id,) = world.add_campaign(pairs=1)
+    admin, path = world.client("ada"), f"/campaigns/{campaign_id}"
+    assert admin.patch(path, json={"criterion": " Go right.\n"}).json()["criterion"] == "Go right."
+    assert admin.patch(path, json={"criterion": " \n"}).status_code == 422
+    with world.database.write() as session:
+        session.get_one(
+            factories.Campaign, campaign_id
+        ).criterion = "Go right.\n"  # of an earlier version
+        factories.add_label(session, session.get_one(factories.Pair, pair_id), world.ids["ann"])
+    answer = admin.patch(path, json={"criterion": "Go right."})
+    assert (answer.status_code, answer.json()["criterion"]) == (200, "Go right.\n")
+
+
 def test_archived_campaigns_leave_the_list_and_take_no_work(world: World) -> None:
     campaign_id, _ = world.add_campaign()
     admin = world.client("ada")
@@ -214,7 +228,7 @@ def test_stats_count_what_is_in_force(world: World) -> None:
     stats = world.client("ada").get(f"/campaigns/{campaign_id}/stats").json()
     assert stats == {
         "episodes": 8,
-        "pairs": {"ready": 3, "waiting": 0, "failed": 1, "labelled": 2},
+        "pairs": {"ready": 3, "waiting": 0, "failed": 1, "labelled": 2, "reported": 0},
         "labels": {
             "total": 6,
             "effective": 3,

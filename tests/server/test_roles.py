@@ -40,6 +40,8 @@ ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/pairs/1", None, STAFF),
     ("GET", "/pairs/1/episodes", None, STAFF),
     ("POST", "/campaigns/1/next", {}, ALL),
+    ("POST", "/leases/999/release", {"reason": "skipped"}, ALL),
+    ("GET", "/campaigns/1/releases", None, STAFF),
     ("POST", "/labels", LABEL, ALL),
     ("POST", "/labels/999/undo", None, ALL),
     ("GET", "/campaigns/1/labels", None, ADMIN),

@@ -233,6 +233,22 @@ def test_settings_are_changed_in_the_dialog(studio: Studio, page: Page) -> None:
     assert row.settings["round_after_labels"] == 40
 
 
+def test_settings_are_stored_beside_a_criterion_that_ends_in_a_new_line(
+    studio: Studio, page: Page
+) -> None:
+    campaign, stored = studio.add_campaign([True]), "Prefer left.\r\nSlowly.\n"
+    with studio.database.write() as session:
+        session.get_one(Campaign, campaign).criterion = stored
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("Start a round by itself").fill("40")
+    confirm(page, "Save")
+    with studio.database.read() as session:
+        row = session.get_one(Campaign, campaign)
+    assert (row.criterion, row.settings["round_after_labels"]) == (stored, 40)
+
+
 def test_new_account_can_sign_in_until_it_is_deactivated(studio: Studio, page: Page) -> None:
     sign_in(page, studio, "admin", "/admin")
     name = studio.new_name("guest")

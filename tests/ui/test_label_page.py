@@ -243,7 +243,7 @@ def test_label_given_without_network_is_kept_and_sent_once_later(
     assert driver.page.evaluate(stored) == 1
     context.set_offline(False)
     studio.wait_for_labels(campaign, 1)
-    until(driver.page, "document.querySelector('#banner').hidden")
+    until(driver.page, "document.querySelector('#outbox-waiting').hidden")
     assert driver.page.evaluate(stored) == 0
     assert [row.choice for row in studio.labels(campaign)] == [Choice.FIRST]
 
@@ -297,7 +297,7 @@ def test_label_after_the_session_ended_is_sent_after_signing_in_again(
     driver = label_page(campaign)
     context.clear_cookies()
     driver.press("ArrowRight")
-    page.locator("#banner").get_by_role("link", name="sign in").click()
+    page.locator("#outbox-waiting").get_by_role("link", name="sign in").click()
     assert studio.labels(campaign) == []
     page.get_by_label("Name").fill(driver.name)
     page.get_by_label("Password").fill(PASSWORD)
@@ -312,7 +312,7 @@ def test_another_person_on_the_same_device_does_not_send_what_waits(
     driver = label_page(campaign)
     context.clear_cookies()
     driver.press("ArrowRight")
-    page.locator("#banner").get_by_role("link", name="sign in").wait_for()
+    page.locator("#outbox-waiting").get_by_role("link", name="sign in").wait_for()
     sign_in(page, studio, studio.add_annotator(), f"/label/{campaign}")
     # The pair is still leased to the other one, so there is nothing for this one.
     page.locator("[data-nothing]").wait_for()

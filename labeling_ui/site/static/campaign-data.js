@@ -13,6 +13,7 @@ const OF_EVENT = {
   state: ["rounds", "jobs", "checkpoints", "stats"],
   curve: ["curves"],
   label: ["stats"],
+  release: ["stats"],
   publication: ["campaign", "checkpoints", "stats"],
 };
 // What else a job changes when it ends; everything it does to a round comes as "state".

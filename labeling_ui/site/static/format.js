@@ -1,4 +1,4 @@
-// Numbers and times as people read them.
+// Numbers, times and names as people read them.
 
 export const percent = (rate, digits = 0) =>
   rate === null || rate === undefined ? "–" : `${(100 * rate).toFixed(digits)} %`;
@@ -27,6 +27,8 @@ export function ago(text, now = Date.now()) {
 
 export const day = (text) =>
   new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
+
+export const CHOICES = { left: "A is better", right: "B is better", equal: "Equal", cannot_tell: "Can’t tell" };
 
 const SPELLINGS = {
   finetuning: "fine-tuning", finetune: "fine-tune", bradley_terry: "Bradley–Terry", dawid_skene: "Dawid–Skene",

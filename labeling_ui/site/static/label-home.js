@@ -1,5 +1,11 @@
 import { ApiError, getAll, signInAddress } from "./api.js";
 import { describe, element, find, replace } from "./dom.js";
+import { Outbox } from "./outbox.js";
+import { showOutbox } from "./outbox-notes.js";
+
+const outbox = new Outbox(document.body.dataset.meId);
+showOutbox(outbox);
+outbox.flush(); // what waits since the last visit
 
 const box = find("#campaigns");
 

@@ -1,92 +1,59 @@
 // The annotator's page: one pair on stage, the next one waiting behind it.
 
-import { ApiError, OfflineError, request, signInAddress } from "./api.js";
-import { describe, element, find, findAll, replace, toast } from "./dom.js";
+import { ApiError, OfflineError, kindOf } from "./api.js";
+import { describe, element, find, findAll, toast } from "./dom.js";
+import { CHOICES } from "./format.js";
+import { listenToKeys } from "./keys.js";
 import { Outbox } from "./outbox.js";
+import { showOutbox } from "./outbox-notes.js";
 import { Player, canDraw3d } from "./player.js";
 import * as notes from "./stage-notes.js";
+import { Supply } from "./supply.js";
 import { Transport } from "./transport.js";
 import { Watch } from "./watch.js";
 
-const CHOICES = { left: "A is better", right: "B is better", equal: "Equal", cannot_tell: "Can’t tell" };
 const SETTLE_MS = 350; // a second press of the key that judged the last pair must not judge this one
-const RETRY_MS = { replays_waiting: 3000, no_pairs: 10_000, all_done: 20_000, offline: 4000 };
+const RETRY_MS = { replays_waiting: 3000, no_pairs: 10_000, all_done: 20_000, offline: 4000, busy: 8000 };
 const MAX_HISTORY = 50;
 
 const { campaignId, meId, uiVersion } = document.body.dataset;
 const stage = find("#stage");
 const outbox = new Outbox(meId);
+const supply = new Supply(campaignId, outbox, prepare);
 const transport = new Transport();
 const has3d = canDraw3d();
 
 let current = null; // {handout, player | null, watch, shownAt}
-let upcoming = []; // pairs of the same form that come next, first one first
 const history = []; // what was judged here, the newest last: {item, key, choice}
 let progress = null; // {done, remaining} as of the last answer, counted on from there
 let retryTimer = null;
 let turn = 0; // counts what is put on stage, so that a late answer does not push something else off
 
-// ---- getting pairs ---------------------------------------------------------------------------
-
-async function fetchNext(body) {
-  const answer = await request("POST", `/campaigns/${campaignId}/next`, { body });
-  if (answer.status === 204) return { reason: answer.headers.get("X-Reason") ?? "no_pairs" };
-  return { handout: answer.data };
-}
-
-function makeReplay(handout, active) {
+function prepare(handout, active) {
   if (!has3d || !handout.pair.replay_url) return { handout, player: null };
   return { handout, player: new Player(stage, handout.pair.replay_url, { view: transport.view, active }) };
 }
 
+// ---- showing a pair --------------------------------------------------------------------------
+
 async function showNext() {
   clearTimeout(retryTimer);
-  dropExpired();
-  const waiting = upcoming.shift();
+  const waiting = supply.take();
   if (waiting) return show(waiting);
   transport.attach(null);
   enableChoices(false);
   const mine = (turn += 1);
   if (!notes.shown()) notes.loading("Fetching the next pair");
   try {
-    await outbox.flush(); // a label on its way would make the server offer its pair again
-    const { handout, reason } = await fetchNext({ hold: 1 });
-    if (mine !== turn) return;
-    if (handout) {
-      progress = handout.progress;
-      show(makeReplay(handout, true));
-    } else {
-      tellNothing(reason);
-    }
+    const { item, reason } = await supply.next();
+    if (mine !== turn) return item?.player?.close();
+    if (!item) return tellNothing(reason);
+    progress = item.handout.progress;
+    show(item);
   } catch (error) {
     if (mine === turn) tellProblem(error);
   }
 }
-
-// A pair whose lease has run out while it waited may be somebody else's by now.
-function dropExpired() {
-  const now = Date.now();
-  const expired = (item) => !item.reopened && new Date(item.handout.expires_at).getTime() < now;
-  upcoming.filter(expired).forEach((item) => item.player?.close());
-  upcoming = upcoming.filter((item) => !expired(item));
-}
-
-async function prefetch() {
-  const item = current;
-  if (!item || upcoming.length > 0) return;
-  try {
-    await outbox.flush();
-    if (outbox.entries.length > 0 || current !== item || upcoming.length > 0) return;
-    const { handout } = await fetchNext({ hold: 2, prefetch_after_pair_id: item.handout.pair.id });
-    if (!handout || current !== item || upcoming.length > 0) return;
-    if (handout.pair.id !== item.handout.pair.id) upcoming.push(makeReplay(handout, false));
-  } catch (error) {
-    // Not being able to look ahead hurts nobody; the next step reports what is wrong.
-    if (!(error instanceof OfflineError) && !(error instanceof ApiError)) throw error;
-  }
-}
-
-// ---- showing a pair --------------------------------------------------------------------------
 
 function show(item) {
   turn += 1;
@@ -101,20 +68,35 @@ function show(item) {
   };
   showProgress();
   if (!item.player) return showPoster(item);
+  if (item.player.closed || item.player.failure) renew(item);
   item.player.setActive(true);
-  if (item.wired) return item.player.isReady ? begin(item) : undefined;
-  item.wired = true;
-  item.player.addEventListener("ready", () => { if (current === item) begin(item); });
-  item.player.addEventListener("state", ({ detail }) => {
-    if (current !== item) return;
-    transport.show(detail);
-    item.watch?.follow(detail);
-  });
-  item.player.addEventListener("key", ({ detail }) => { if (current === item) onKey(detail); });
-  item.player.addEventListener("activity", () => item.watch?.input());
-  item.player.addEventListener("failed", ({ detail }) => { if (current === item) tellFailedReplay(item, detail); });
+  wire(item);
   if (item.player.isReady) begin(item);
   else notes.loading("Loading the replay");
+}
+
+// Another try for a replay that was put away, or that failed while it waited.
+function renew(item) {
+  item.player.close();
+  Object.assign(item, prepare(item.handout, true), { wired: false });
+}
+
+function wire(item) {
+  if (item.wired) return;
+  item.wired = true;
+  const whenShown = (name, action) =>
+    item.player.addEventListener(name, ({ detail }) => { if (current === item) action(detail); });
+  whenShown("ready", () => begin(item));
+  whenShown("state", (state) => {
+    transport.show(state);
+    item.watch?.follow(state);
+  });
+  whenShown("key", pressedInScene);
+  whenShown("activity", () => {
+    item.watch?.input();
+    find(".menu").open = false; // a click in the scene is a click outside the menu
+  });
+  whenShown("failed", (failure) => tellFailedReplay(item, failure));
 }
 
 function begin(item) {
@@ -127,14 +109,14 @@ function begin(item) {
   item.settled = performance.now() + SETTLE_MS;
   enableChoices(true);
   stage.dataset.pairId = item.handout.pair.id;
-  prefetch();
+  supply.lookAhead(item, () => current === item);
 }
 
 // Without WebGL: the moving picture of both paths.
 function showPoster(item) {
   const { thumbnail_url: picture } = item.handout.pair;
   transport.attach(null);
-  if (!picture) return tellFailedReplay(item, "This browser cannot draw 3D, and there is no picture.");
+  if (!picture) return tellFailedReplay(item, { message: "This browser cannot draw 3D, and there is no picture." });
   notes.clear();
   const about = "Paths of run A and run B seen from above";
   stage.append(element("img.poster", { src: picture, alt: about }));
@@ -143,7 +125,7 @@ function showPoster(item) {
   item.settled = performance.now() + SETTLE_MS;
   enableChoices(true);
   stage.dataset.pairId = item.handout.pair.id;
-  prefetch();
+  supply.lookAhead(item, () => current === item);
 }
 
 function enableChoices(enabled) {
@@ -177,6 +159,7 @@ function judge(choice) {
   history.at(-1)?.item.player?.close();
   history.push({ item, key, choice });
   if (history.length > MAX_HISTORY) history.shift();
+  showUndo();
   if (progress) progress = { done: progress.done + 1, remaining: Math.max(0, progress.remaining - 1) };
   leave(item);
   toast(CHOICES[choice], { action: "Undo", onAction: undo });
@@ -199,43 +182,45 @@ function setAside(item) {
 
 function undo() {
   const last = history.pop();
+  showUndo();
   if (!last) return toast("There is nothing to undo on this page.");
   outbox.undo(last.key);
   if (current) {
     setAside(current);
     enableChoices(false);
-    upcoming.unshift(current);
+    supply.putFirst(current);
   }
   clearTimeout(retryTimer);
   if (progress) progress = { done: Math.max(0, progress.done - 1), remaining: progress.remaining + 1 };
-  const { item } = last;
-  if (!item.player || item.player.closed) Object.assign(item, makeReplay(item.handout, true), { wired: false });
-  show(Object.assign(item, { reopened: true }));
+  show(Object.assign(last.item, { reopened: true }));
   toast(`Taken back: ${CHOICES[last.choice]}. Judge this pair again.`);
+}
+
+function showUndo() {
+  find("#undo").disabled = history.length === 0;
 }
 
 outbox.addEventListener("sent", ({ detail: { entry, answer } }) => {
   // The server has handed the pair out again, under a new lease.
-  if (entry.kind === "undo" && current?.handout.pair.id === answer.next?.pair.id) {
+  if (entry.kind === "undo" && answer.next && current?.handout.pair.id === answer.next.pair.id) {
     current.handout.lease_id = answer.next.lease_id;
   }
 });
 
-outbox.addEventListener("refused", ({ detail: { entry, error } }) => {
-  const what = entry.kind === "undo" ? "The undo was not possible" : "A label was not accepted";
-  toast(`${what}: ${describe(error)}`, { bad: true, seconds: 12 });
-});
-
-outbox.addEventListener("change", ({ detail: { waiting, offline, signedOut } }) => {
-  const banner = find("#banner");
-  banner.hidden = !(waiting > 0 && (offline || signedOut));
-  if (banner.hidden) return;
-  const labels = waiting === 1 ? "1 answer is" : `${waiting} answers are`;
-  const text = signedOut
-    ? `You are signed out. ${labels} kept on this device and will be sent after you`
-    : `No connection. ${labels} kept on this device and will be sent as soon as the server answers.`;
-  replace(banner, element("span", {}, text), signedOut ? element("a", { href: signInAddress() }, "sign in") : null);
-});
+// Without a label: the pair goes to others, and the admins hear why.
+async function skip(item, reason) {
+  leave(item);
+  item.player?.close();
+  const mine = (turn += 1);
+  notes.loading("Giving the pair back");
+  try {
+    await supply.release(item, reason);
+    if (progress) progress = { ...progress, remaining: Math.max(0, progress.remaining - 1) };
+    if (mine === turn) showNext();
+  } catch (error) {
+    if (mine === turn) tellProblem(error);
+  }
+}
 
 // ---- what went wrong, or why there is nothing -------------------------------------------------
 
@@ -249,66 +234,52 @@ function tellNothing(reason) {
 }
 
 function tellProblem(error) {
-  if (error instanceof ApiError && error.status === 401) notes.signedOut();
-  else if (error instanceof OfflineError) {
-    notes.offline(showNext);
-    retryTimer = setTimeout(showNext, RETRY_MS.offline);
-  } else notes.problem("That did not work", describe(error), showNext);
+  const known = error instanceof ApiError || error instanceof OfflineError;
+  const kind = known ? kindOf(error) : "final";
+  if (kind === "signedOut") return notes.signedOut();
+  if (kind === "final") return notes.problem("That did not work", describe(error), showNext);
+  if (kind === "offline") notes.offline(showNext);
+  else notes.busy(describe(error), showNext);
+  retryTimer = setTimeout(showNext, RETRY_MS[kind]);
 }
 
-function tellFailedReplay(item, message) {
-  notes.problem("The replay is not there", message, () => {
-    item.player?.close();
-    show(makeReplay(item.handout, true));
+function tellFailedReplay(item, { message, status }) {
+  if (status === 401) return notes.signedOut();
+  const broken = item.player !== null;
+  notes.failedReplay(message, {
+    retry: () => show(item),
+    skipLabel: broken ? "Skip and report" : "Skip",
+    skip: () => skip(item, broken ? "replay_failed" : "skipped"),
   });
 }
 
 // ---- keys and buttons ------------------------------------------------------------------------
 
-const KEYS = {
-  ArrowLeft: () => judge("left"),
-  ArrowRight: () => judge("right"),
-  ArrowUp: () => judge("equal"),
-  ArrowDown: () => judge("cannot_tell"),
-  " ": () => transport.toggle(),
-  z: undo,
-  Backspace: undo,
-  r: () => transport.restart(),
-  "[": () => transport.changeSpeed(-1),
-  "]": () => transport.changeSpeed(1),
-  ",": () => transport.step(-1),
-  ".": () => transport.step(1),
-  1: () => transport.setView("front"),
-  2: () => transport.setView("top"),
-  3: () => transport.setView("low"),
-  "?": () => find("#help").showModal(),
+const openHelp = () => find("#help").showModal();
+const ACTIONS = {
+  ...Object.fromEntries(Object.keys(CHOICES).map((choice) => [choice, () => judge(choice)])),
+  undo,
+  toggle: () => transport.toggle(),
+  restart: () => transport.restart(),
+  back: () => transport.step(-1),
+  on: () => transport.step(1),
+  slower: () => transport.changeSpeed(-1),
+  faster: () => transport.changeSpeed(1),
+  front: () => transport.setView("front"),
+  top: () => transport.setView("top"),
+  low: () => transport.setView("low"),
+  help: openHelp,
 };
-
-// Returns whether the key means something here. Only frame steps may repeat while held down.
-function onKey({ key, repeat }) {
-  const name = key.length === 1 ? key.toLowerCase() : key;
-  const action = KEYS[name];
-  if (!action) return false;
+const pressedInScene = listenToKeys((command) => {
   current?.watch?.input();
-  if (!repeat || name === "," || name === ".") action();
-  return true;
-}
-
-document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || find("dialog[open]")) return;
-  const { tagName } = event.target;
-  if (tagName === "SELECT" || (event.key === " " && (tagName === "BUTTON" || tagName === "SUMMARY"))) return;
-  if (event.target === transport.scrubber && event.key.startsWith("Arrow")) return;
-  if (onKey(event)) event.preventDefault();
+  ACTIONS[command]();
 });
 
 for (const button of findAll(".choice")) {
-  button.addEventListener("click", (event) => {
-    if (event.detail > 0) button.blur(); // after a mouse click the space bar is for the replay
-    judge(button.dataset.choice);
-  });
+  button.addEventListener("click", () => judge(button.dataset.choice));
 }
-find("#help-button").addEventListener("click", () => find("#help").showModal());
+find("#help-button").addEventListener("click", openHelp);
+find("#undo").addEventListener("click", undo);
 for (const kind of ["pointerdown", "pointermove"]) {
   document.addEventListener(kind, () => current?.watch?.input(), { passive: true });
 }
@@ -318,5 +289,5 @@ window.addEventListener("resize", () => {
   resizeTimer = setTimeout(() => current?.player?.setView(transport.view), 200);
 });
 
-outbox.tell();
+showOutbox(outbox);
 showNext();

@@ -32,6 +32,7 @@ export function tiles(stats, evaluation) {
   const open = [
     pairs.waiting > 0 ? `${count(pairs.waiting)} being made` : null,
     pairs.failed > 0 ? `${count(pairs.failed)} failed` : null,
+    pairs.reported > 0 ? `${count(pairs.reported)} reported: the replay does not play` : null,
     `${count(pairs.labelled)} labelled`,
   ];
   const rate = (key) => {

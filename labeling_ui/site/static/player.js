@@ -1,8 +1,10 @@
 // One replay of a pair in viser's client, driven by messages. See replay-adapter.js.
 //
-// Events (CustomEvent): "ready", "state", "key", "activity", "failed" (detail: message)
+// Events (CustomEvent): "ready", "state", "key", "activity", "failed" (detail: {message, status})
+// A failure is remembered in `failure`: a waiting replay fails before anybody listens.
 
 import { cameraParameters, fitCamera } from "./camera.js";
+import { PAGE_KEYS } from "./keys.js";
 
 const READY_TIMEOUT_MS = 45_000; // software rendering on a busy machine takes seconds
 export const SPEEDS = [0.5, 1, 2, 4];
@@ -15,6 +17,7 @@ export class Player extends EventTarget {
     this.replayUrl = replayUrl;
     this.view = view;
     this.state = null;
+    this.failure = null; // {message, status: of the server's answer, if there was one}
     this.frame = document.createElement("iframe");
     this.frame.title = "3D replay of run A and run B";
     this.frame.className = "replay";
@@ -35,12 +38,12 @@ export class Player extends EventTarget {
     try {
       const answer = await fetch(this.replayUrl);
       if (!answer.ok) {
-        const why = answer.status === 401 ? "you are signed out" : `the server said ${answer.status}`;
-        throw new Error(`The replay could not be loaded: ${why}.`);
+        this.fail(`The replay could not be loaded: the server said ${answer.status}.`, answer.status);
+        return;
       }
       await answer.arrayBuffer();
     } catch (error) {
-      this.fail(error.message);
+      this.fail(`The replay could not be loaded: ${error.message}.`);
       return;
     }
     if (this.closed) return;
@@ -52,6 +55,7 @@ export class Player extends EventTarget {
     const query = new URLSearchParams({
       playbackPath: this.replayUrl,
       logCamera: "1",
+      keys: JSON.stringify(PAGE_KEYS),
       ...cameraParameters(camera),
       ...extra,
     });
@@ -71,6 +75,7 @@ export class Player extends EventTarget {
     if (message.kind === "replay-ready") {
       clearTimeout(this.timer);
       this.isReady = true;
+      this.failure = null;
       this.emit("ready", message);
     } else if (message.kind === "replay-state") {
       this.state = message;
@@ -106,9 +111,11 @@ export class Player extends EventTarget {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 
-  fail(message) {
+  fail(message, status = null) {
     clearTimeout(this.timer);
-    if (!this.closed && !this.isReady) this.emit("failed", message);
+    if (this.closed || this.isReady) return;
+    this.failure = { message, status };
+    this.emit("failed", this.failure);
   }
 
   close() {

@@ -5,7 +5,8 @@
 //          camera ({position, lookAt} in metres of the recording)
 //   out  {kind: "replay-ready", duration}
 //        {kind: "replay-state", t, duration, paused, speed, camera}
-//        {kind: "replay-key", code, key, shiftKey, repeat}     keys typed while the scene has focus
+//        {kind: "replay-key", code, key, shiftKey, repeat}     those of the URL's ?keys=["…", …] that
+//                                                              are typed while the scene has focus
 //        {kind: "replay-activity"}                             the pointer is at work in the scene
 //        {kind: "replay-error", message}
 //        {kind: "replay-camera-refused", arg}                  load the page anew with this camera
@@ -176,14 +177,17 @@
     else post({ kind: "replay-error", message: `unknown operation ${event.data.op}` });
   });
 
-  // Keys belong to the page around the scene, wherever the focus is.
+  // The keys that the page around the scene knows belong to it, wherever the focus is. The client
+  // gets none; what the page does not know, such as F5, stays the browser's.
+  const pageKeys = JSON.parse(parameters.get("keys") ?? "[]");
   window.addEventListener(
     "keydown",
     (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey || event.key === "Tab") return;
       event.stopImmediatePropagation();
-      event.preventDefault();
       const { code, key, shiftKey, repeat } = event;
+      if (!pageKeys.includes(key.length === 1 ? key.toLowerCase() : key)) return;
+      event.preventDefault();
       post({ kind: "replay-key", code, key, shiftKey, repeat });
     },
     true,

@@ -48,6 +48,21 @@ export function offline(retry) {
   set(element("h2", {}, "No connection to the server"), element("p", {}, text), button("Try now", retry));
 }
 
+export function busy(text, retry) {
+  set(
+    element("h2", {}, "The server cannot take answers now"),
+    element("p", {}, `Your answers are safe on this device. This page goes on by itself. (${text})`),
+    button("Try now", retry),
+  );
+}
+
 export function problem(title, text, retry) {
   set(element("h2", {}, title), element("p", {}, text), button("Try again", retry));
+}
+
+export function failedReplay(text, { retry, skip, skipLabel }) {
+  set(
+    element("h2", {}, "The replay is not there"), element("p", {}, text),
+    element("div.note-actions", {}, button("Try again", retry), button(skipLabel, skip)),
+  );
 }
