@@ -13,9 +13,9 @@ const METHODS = [
 const RULES = [
   ["auto", "Publish when the gate passes"], ["manual", "Wait for an admin"], ["never", "Comparison only"],
 ];
-const ARCHIVED = [["false", "in use"], ["true", "archived"]];
 // A text as a form gives it back.
 const plain = (text) => text.replaceAll("\r\n", "\n").trim();
+const ARCHIVED = [["false", "in use"], ["true", "archived"]];
 const REASON = { name: "reason", label: "Reason", value: "", placeholder: "kept in the audit trail" };
 
 // `data` is the page's own object: {campaign, stats, checkpoints, …}, kept up to date by the page.
@@ -63,28 +63,28 @@ export function campaignActions(id, data, refresh) {
   };
 
   const settings = () => {
-    const { criterion: asked, settings: now } = data.campaign;
+    const before = data.campaign; // as the dialog shows it; the page goes on refreshing its own
+    const now = before.settings;
     return confirmed("The settings are stored.", {
       title: "Settings",
       confirm: "Save",
       fields: [
-        { name: "name", label: "Name", value: data.campaign.name, required: true },
-        { name: "criterion", label: "What annotators are asked", kind: "textarea", value: asked, required: true },
+        { name: "name", label: "Name", value: before.name, required: true },
+        { name: "criterion", label: "What annotators are asked", kind: "textarea", value: before.criterion, required: true },
         { name: "labels_per_pair", label: "Labels per pair", kind: "number", value: now.labels_per_pair, min: 1, max: 20, step: 1, required: true, hint: "Two or more let the noise be measured from overlap." },
         { name: "round_after_labels", label: "Start a round by itself after this many new labels", kind: "number", value: now.round_after_labels, min: 0, step: 1, required: true, hint: "0: only by hand." },
         { name: "round_every_minutes", label: "… or every so many minutes, when there are new labels", kind: "number", value: now.round_every_minutes, min: 0, step: "any", required: true, hint: "0: never." },
         { name: "method", label: "Method", kind: "select", value: now.method, options: METHODS },
         { name: "publish_rule", label: "Publishing", kind: "select", value: now.publish_rule, options: RULES },
         { name: "evaluation_episodes", label: "Evaluation runs", kind: "number", value: now.evaluation_episodes, min: 10, max: 10000, step: 1, required: true },
-        { name: "archived", label: "Campaign", kind: "select", value: String(data.campaign.archived), options: ARCHIVED, hint: "An archived campaign hands out no pairs and starts no rounds; nothing is deleted." },
+        { name: "archived", label: "Campaign", kind: "select", value: String(before.archived), options: ARCHIVED, hint: "An archived campaign hands out no pairs and starts no rounds; nothing is deleted." },
       ],
-      // The criterion is fixed once there are labels: sent only when it was edited.
+      // Only what was edited: the criterion is fixed once there are labels.
       onSubmit: ({ name, criterion, archived, ...changed }) => {
-        const now = { name: data.campaign.name, archived: String(data.campaign.archived) };
-        const edited = criterion === plain(asked) ? {} : { criterion };
-        const renamed = name === now.name ? {} : { name };
-        const moved = archived === now.archived ? {} : { archived: archived === "true" };
-        return request("PATCH", `/campaigns/${id}`, { body: { settings: changed, ...edited, ...renamed, ...moved } });
+        const renamed = name === before.name ? {} : { name };
+        const asked = criterion === plain(before.criterion) ? {} : { criterion };
+        const moved = archived === String(before.archived) ? {} : { archived: archived === "true" };
+        return request("PATCH", `/campaigns/${id}`, { body: { settings: changed, ...renamed, ...asked, ...moved } });
       },
     });
   };
