@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from worker.cli.client import Client
     from worker.cli.simulate import SimulationReport
 
-# A demo that steers less has failed; where most successes are as preferred already, half of the
-# others are enough.
-ALIGNMENT_GAIN, GAP_SHARE = 0.30, 0.5
+# A demo that steers less has failed; where the policy mostly does what is preferred already, two
+# fifths of what was missing are enough.
+ALIGNMENT_GAIN, GAP_SHARE = 0.30, 0.4
 MEASURES = ("success", "alignment", "alignment_of_successes", "off_support", "n", "intervals")
 COMPARED = (FinetuneMethod.RODIF, FinetuneMethod.DP_DPO)
 # For one stage. Work that fails says so at once; this only ends a demo that hangs, and must not end
@@ -99,8 +99,7 @@ class DemoResult:
         """Why the demo did not show what it is for; empty when it did."""
         before, after = self.evaluations["before"], self.evaluations["after"]
         found = []
-        # What steering alone can win are the successes that go another way.
-        wanted = min(ALIGNMENT_GAIN, GAP_SHARE * (before["success"] - before["alignment"]))
+        wanted = min(ALIGNMENT_GAIN, GAP_SHARE * (1 - before["alignment"]))
         if after["alignment"] - before["alignment"] < wanted:
             found.append(
                 f"alignment went from {before['alignment']:.3f} to {after['alignment']:.3f};"
