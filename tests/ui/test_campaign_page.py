@@ -123,8 +123,9 @@ def test_round_is_followed_live_published_and_rolled_back(studio: Studio, page: 
     candidate = worker.finish(evaluation(22, 70, 8), evaluation(91, 3, 6))
     page.locator("#rounds").get_by_text("published").wait_for()
     live.wait_for(state="detached")
-    assert tile(page, "Alignment, published") == "91 %"
-    assert "22 % → 91 %" in page.locator("#rounds").inner_text()
+    page.locator(".tile", has_text="Alignment, published").get_by_text("91 %").wait_for()
+    page.locator("#rounds").get_by_text("22 % → 91 %").wait_for()
+    page.locator("#behaviour svg").nth(1).wait_for()
     before, after = page.locator("#behaviour svg").all()
     lefts = 'polyline[data-group="left"]'
     assert (before.locator(lefts).count(), after.locator(lefts).count()) == (22, 91)

@@ -271,7 +271,6 @@ def test_label_whose_answer_was_lost_is_stored_once(
     studio: Studio, label_page: Opened, page: Page
 ) -> None:
     campaign = studio.add_campaign([True])
-    driver = label_page(campaign)
     keys: list[str | None] = []  # of each attempt to send the label
 
     def lose_the_first_answer(route: Route) -> None:
@@ -282,8 +281,8 @@ def test_label_whose_answer_was_lost_is_stored_once(
         else:
             route.continue_()
 
-    page.route("**/api/v1/labels", lose_the_first_answer)
-    driver.press("ArrowLeft")
+    page.route("**/api/v1/labels", lose_the_first_answer)  # an open page's may pass by a new route
+    label_page(campaign).press("ArrowLeft")
     studio.wait_for_labels(campaign, 1)
     until(page, "!Object.keys(localStorage).some((key) => key.startsWith('rodif-outbox'))")
     assert len(keys) == 2 and keys[0] == keys[1]

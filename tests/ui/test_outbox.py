@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -13,12 +14,13 @@ from playwright.sync_api import BrowserContext, Page, Route
 
 from server.states import Choice
 from server.store.tables import Campaign
-from tests.ui.driving import LabelPage, take_session, until
+from tests.ui.driving import PATIENCE, LabelPage, take_session, until
 from tests.ui.studio import Studio
 
 pytestmark = pytest.mark.browser
 Opened = Callable[[int], LabelPage]
 
+# Routes are laid before the page is opened: an open page's requests may still pass by a new one.
 LABELS = "**/api/v1/labels"
 STORED = "Object.keys(localStorage).filter((key) => key.startsWith('rodif-outbox')).length"
 JSON = "application/json"
@@ -67,7 +69,6 @@ def test_label_is_kept_until_the_server_itself_says_that_it_is_stored(
     studio: Studio, label_page: Opened, page: Page
 ) -> None:
     campaign = studio.add_campaign([True])
-    driver = label_page(campaign)
     odd, keys = list(ODD_ANSWERS), []
 
     def answer_oddly(route: Route) -> None:
@@ -79,9 +80,11 @@ def test_label_is_kept_until_the_server_itself_says_that_it_is_stored(
             route.continue_()
 
     page.route(LABELS, answer_oddly)
-    driver.press("ArrowLeft")
+    label_page(campaign).press("ArrowLeft")
     for attempt in range(1, len(ODD_ANSWERS) + 1):
+        deadline = time.monotonic() + PATIENCE
         while len(keys) < attempt:
+            assert time.monotonic() < deadline, f"the label was sent {len(keys)} times"
             _try_now(page)
             page.wait_for_timeout(20)
         assert page.evaluate(STORED) == 1, ODD_ANSWERS[attempt - 1]
@@ -94,10 +97,9 @@ def test_label_is_kept_when_the_answer_breaks_off(
     studio: Studio, label_page: Opened, page: Page
 ) -> None:
     campaign = studio.add_campaign([True])
-    driver = label_page(campaign)
     with _breaking_off() as address:
         page.route(LABELS, lambda route: route.continue_(url=address))
-        driver.press("ArrowLeft")
+        label_page(campaign).press("ArrowLeft")
         page.get_by_text("1 answer is kept on this device").wait_for()
         assert page.evaluate(STORED) == 1
         page.unroute(LABELS)
@@ -139,9 +141,8 @@ def test_what_the_server_does_not_accept_is_shown_kept_and_sent_again_on_request
 ) -> None:
     studio.add_campaign()  # a second one: the choice of campaigns stays on the screen
     campaign = studio.add_campaign([True])
-    driver = label_page(campaign)
     page.route(LABELS, _name_another_lease)
-    driver.press("ArrowLeft")
+    label_page(campaign).press("ArrowLeft")
     page.get_by_text("1 answer was not accepted.").wait_for()
     page.unroute(LABELS)
     page.goto(f"{studio.url}/label")
@@ -160,8 +161,8 @@ def test_answer_that_is_not_accepted_does_not_hold_up_the_next_one_and_can_be_di
 ) -> None:
     studio.add_campaign()
     campaign = studio.add_campaign([True, False])
-    driver = label_page(campaign)
     page.route(LABELS, _name_another_lease, times=1)
+    driver = label_page(campaign)
     driver.press("ArrowLeft")
     page.get_by_text("1 answer was not accepted.").wait_for()
     shown = driver.wait_ready()
@@ -196,11 +197,11 @@ def test_pair_whose_label_could_not_be_stored_is_not_judged_twice(
     studio: Studio, label_page: Opened, page: Page, status: int
 ) -> None:
     campaign = studio.add_campaign([True])
-    driver = label_page(campaign)
     problem = json.dumps({"title": "Oh", "status": status, "detail": "later, please"})
     page.route(
         LABELS, lambda route: route.fulfill(status=status, content_type=PROBLEM, body=problem)
     )
+    driver = label_page(campaign)
     driver.press("ArrowLeft")
     page.get_by_role("heading", name="The server cannot take answers now").wait_for()
     page.wait_for_timeout(1000)
@@ -217,9 +218,8 @@ def test_labels_that_wait_are_sent_from_the_choice_of_campaigns(
 ) -> None:
     studio.add_campaign()  # a second one: the choice of campaigns stays on the screen
     campaign = studio.add_campaign([True])
-    driver = label_page(campaign)
     page.route(LABELS, lambda route: route.abort())
-    driver.press("ArrowLeft")
+    label_page(campaign).press("ArrowLeft")
     page.get_by_text("1 answer is kept on this device").wait_for()
     page.goto(f"{studio.url}/label")
     page.get_by_text("1 answer is kept on this device").wait_for()

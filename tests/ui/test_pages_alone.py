@@ -103,3 +103,31 @@ def test_pages_fit_a_phone_and_every_control_has_a_name(
           .map((item) => item.outerHTML)"""
     )
     assert nameless == []
+
+
+# What a click or a key would reach: visible, enabled, and not below a part that is switched off.
+WITHIN_REACH = """[...document.querySelectorAll("button, select, input[type=checkbox]")]
+  .filter((item) => item.checkVisibility() && !item.disabled && !item.closest(".off"))
+  .map((item) => item.outerHTML)"""
+
+
+@pytest.mark.parametrize("path", ["/admin", "/admin/campaigns/{}", "/label/{}"])
+def test_no_control_can_be_used_before_something_listens_to_it(
+    studio: Studio, page: Page, path: str
+) -> None:
+    take_session(page, studio, "admin")
+    page.route("**/static/*.js", lambda route: route.abort())
+    page.goto(studio.url + path.format(studio.add_campaign([True])))
+    page.get_by_label("Account of").click()
+    assert page.evaluate(WITHIN_REACH) == []
+
+
+def test_password_is_sent_by_the_pages_own_script_or_not_at_all(studio: Studio, page: Page) -> None:
+    page.route("**/static/*.js", lambda route: route.abort())
+    page.goto(f"{studio.url}/sign-in")
+    page.get_by_label("Name").fill("admin")
+    page.get_by_label("Password").fill("secret words")
+    page.get_by_label("Password").press("Enter")
+    page.wait_for_timeout(300)
+    assert page.url == f"{studio.url}/sign-in"
+    assert not page.get_by_role("button", name="Sign in").is_enabled()

@@ -1,5 +1,5 @@
 import { request } from "./api.js";
-import { describe, find, toast } from "./dom.js";
+import { describe, enable, find, toast } from "./dom.js";
 
 find("#sign-out").addEventListener("click", async () => {
   try {
@@ -15,3 +15,4 @@ const menu = find(".menu");
 document.addEventListener("click", (event) => {
   if (!menu.contains(event.target)) menu.open = false;
 });
+enable("#sign-out");

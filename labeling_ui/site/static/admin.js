@@ -1,7 +1,7 @@
 // The list of campaigns, and the dialog that makes a new one.
 
 import { ApiError, get, post, signInAddress } from "./api.js";
-import { ask, describe, element, find, replace } from "./dom.js";
+import { ask, describe, element, enable, find, replace } from "./dom.js";
 import { count, words } from "./format.js";
 import { addPerson, drawPeople } from "./people.js";
 
@@ -78,4 +78,5 @@ async function create() {
 archived.addEventListener("change", load);
 find("#new-campaign").addEventListener("click", create);
 find("#new-person").addEventListener("click", addPerson);
+enable("#archived", "#new-campaign", "#new-person");
 load();

@@ -5,7 +5,7 @@ import { gate, legend, measures, pathMap } from "./behaviour.js";
 import { campaignActions } from "./campaign-actions.js";
 import { campaignData, PARTS } from "./campaign-data.js";
 import { drawCurves } from "./curves.js";
-import { describe, element, find, replace } from "./dom.js";
+import { describe, element, enable, find, replace } from "./dom.js";
 import { isRunning, liveCollect, liveRound, liveWords, showProgress } from "./live.js";
 import * as panels from "./panels.js";
 import { renew } from "./steady.js";
@@ -105,6 +105,7 @@ function draw() {
   find("#archived").hidden = !campaign.archived;
   find("#published").textContent = `Published policy: ${published.name}`;
   find(".criterion-text").textContent = `“${campaign.criterion}”`;
+  enable("#collect", "#settings", "#start-round"); // their dialogs show what has been loaded
   find("#rollback").disabled = stats.rollback_checkpoint_id === null;
   renew(find("#tiles"), panels.tiles(stats, evaluationOf(published)));
   renew(find("#annotators"), panels.annotatorTable(stats.annotators));

@@ -3,6 +3,11 @@
 export const find = (selector, root = document) => root.querySelector(selector);
 export const findAll = (selector, root = document) => [...root.querySelectorAll(selector)];
 
+// Controls of the templates come disabled, so that no click is lost before something listens to it.
+export const enable = (...selectors) => {
+  for (const selector of selectors) find(selector).disabled = false;
+};
+
 // element("div.card", {title: "x", onclick: f}, child, "text", …); null children are left out.
 export function element(tag, attributes = {}, ...children) {
   const [name, ...classes] = tag.split(".");

@@ -1,7 +1,7 @@
 // The annotator's page: one pair on stage, the next one waiting behind it.
 
 import { ApiError, OfflineError, kindOf } from "./api.js";
-import { describe, element, find, findAll, toast } from "./dom.js";
+import { describe, element, enable, find, findAll, toast } from "./dom.js";
 import { CHOICES } from "./format.js";
 import { listenToKeys } from "./keys.js";
 import { Outbox } from "./outbox.js";
@@ -289,5 +289,6 @@ window.addEventListener("resize", () => {
   resizeTimer = setTimeout(() => current?.player?.setView(transport.view), 200);
 });
 
+enable("#help-button");
 showOutbox(outbox);
 showNext();

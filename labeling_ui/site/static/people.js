@@ -1,7 +1,7 @@
 // The accounts of the studio: who may label, who may administer; new accounts and passwords.
 
 import { getAll, post, request } from "./api.js";
-import { ask, describe, element, find, replace, toast } from "./dom.js";
+import { ask, describe, element, enable, find, replace, toast } from "./dom.js";
 import { count } from "./format.js";
 import { table } from "./panels.js";
 import { addToken, drawTokens } from "./tokens.js";
@@ -14,6 +14,7 @@ export async function drawPeople() {
   const heads = [["Name"], ["Role"], ["Labels", "number"], [""]];
   replace(find("#people"), table(heads, people.map(row), "Nobody."));
   find("#new-token").onclick = () => addToken(people);
+  enable("#new-token");
   await drawTokens(people);
 }
 

@@ -1,5 +1,5 @@
 import { ApiError, request } from "./api.js";
-import { describe, find } from "./dom.js";
+import { describe, enable, find } from "./dom.js";
 
 const form = find("#sign-in-form");
 const message = find("#sign-in-error");
@@ -40,3 +40,5 @@ form.addEventListener("submit", async (event) => {
     button.disabled = false;
   }
 });
+
+enable("#sign-in-form button"); // before, the browser would have sent the form itself
