@@ -11,11 +11,18 @@ from server.campaigns import create_campaign
 from server.passwords import hash_password
 from server.schemas.campaigns import CampaignSettings
 from server.sign_in import Me, me_of
-from server.states import AnnotatorKind, Choice, JobKind, PairState, Role
+from server.states import AnnotatorKind, Choice, JobKind, PairState, Role, RoundState
 from server.store import jobs
 from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Label, Pair
 
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)
+# The states of a round that is published, after "queued".
+PUBLISHED_PATH = [
+    RoundState.FINETUNING,
+    RoundState.EVALUATING,
+    RoundState.GATING,
+    RoundState.PUBLISHED,
+]
 PASSWORD = "correct horse battery"
 TASK_FACTS = {
     "criterion": "Pass the first obstacle on its left side.",

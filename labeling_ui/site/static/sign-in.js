@@ -1,5 +1,5 @@
 import { ApiError, request } from "./api.js";
-import { describe, enable, find } from "./dom.js";
+import { describe, find } from "./dom.js";
 
 const form = find("#sign-in-form");
 const message = find("#sign-in-error");
@@ -41,4 +41,4 @@ form.addEventListener("submit", async (event) => {
   }
 });
 
-enable("#sign-in-form button"); // before, the browser would have sent the form itself
+button.disabled = false; // before, the browser would have sent the form itself
