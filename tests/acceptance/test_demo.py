@@ -28,13 +28,19 @@ SIZES = {
     "evaluation-episodes": 60,
     "comparison-updates": 2,
 }
+# A full round is what `make demo` and `rodif bench avoid` show; here it need not be repeated.
+QUICK = {
+    "guide": {"self_training_rounds": 1, "self_training_rollouts": 60, "selection_rollouts": 60}
+}
 RATES = ("success", "alignment", "alignment_of_successes", "off_support")
 
 
 def test_headless_demo_writes_the_table_and_leaves_nothing_running(tmp_path: Path):
     table, state = tmp_path / "out.json", tmp_path / "state"
     sizes = [part for name, value in SIZES.items() for part in (f"--{name}", str(value))]
-    command = [sys.executable, "-m", "worker.cli.main", "demo", "--headless"]
+    config = tmp_path / "quick.json"
+    config.write_text(json.dumps(QUICK))
+    command = [sys.executable, "-m", "worker.cli.main", "demo", "--headless", "--config", config]
     done = subprocess.run(
         [*command, "--json", table, "--state", state, *sizes],
         env=os.environ | {"RODIF_ARGON2_CHEAP": "true"},

@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 
 from rodif_core.errors import UnknownNameError
-from rodif_core.spec import FinetuneMethod
+from rodif_core.spec import FinetuneConfig, FinetuneMethod, GuideConfig
 from server.store.tables import Label
 from tests.cli.running_api import RunningApi
 from worker.cli import client as client_module
 from worker.cli import round as rounds
 from worker.cli.client import ApiError, Client
+from worker.cli.simulate import SimulationConfig, simulate
 
 
 def test_campaign_is_found_by_name_number_or_alone(api: RunningApi):
@@ -54,6 +55,20 @@ def test_round_with_an_illegal_gamma_names_the_legal_ones(api: RunningApi):
         rounds.launch(admin, campaign["id"], conservativeness=1.5)
     assert caught.value.status == 422
     assert str(caught.value).count("1.5") == 1, "said once"
+
+
+def test_settings_of_a_round_are_kept_with_it_and_a_named_option_goes_before_them(api: RunningApi):
+    campaign = api.make_campaign([(True, "left"), (True, "right")], "settings")
+    settings = {"conservativeness": 0.1, "guide": {"self_training_rounds": 0}}
+    with api.admin() as admin:
+        simulate(admin, campaign, SimulationConfig(annotators=1, labels=1))
+        started = rounds.launch(admin, campaign["id"], conservativeness=0.4, settings=settings)
+        kept = admin.get(f"/rounds/{started['id']}")["config"]
+    assert kept["conservativeness"] == 0.4
+    assert (
+        kept["guide"]
+        == FinetuneConfig(guide=GuideConfig(self_training_rounds=0)).to_json()["guide"]
+    )
 
 
 def test_silent_address_is_named(monkeypatch: pytest.MonkeyPatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -80,6 +82,29 @@ def test_sizes_out_of_range_are_named(capsys: pytest.CaptureFixture[str]):
         DemoConfig(evaluation_episodes=0)
     assert main(["demo", "--headless", "--labels", "0"]) == 1
     assert "labels is 0, but must be at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is not a readable JSON file"),
+        ("{", "is not a readable JSON file"),
+        ("[1]", r"holds \[1\], not an object of settings"),
+        ('{"gamma": 1}', "gamma"),
+        ('{"guide": {"self_training_rounds": 9}}', r"self_training_rounds is 9.*0 … 5"),
+    ],
+)
+def test_settings_that_the_fine_tuner_lacks_are_named_before_anything_starts(
+    content: str | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = tmp_path / "settings.json"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(SystemExit) as refused:
+        main(["demo", "--config", str(file), "--state", str(tmp_path / "state")])
+    assert refused.value.code == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert not (tmp_path / "state").exists()
 
 
 def test_usual_sizes_grow_with_the_groups_and_measure_long_tasks_on_fewer_rollouts() -> None:

@@ -25,6 +25,7 @@ from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import FinetuneMethod, TaskName
 from server.settings import Settings
 from worker.cli.loop import DemoConfig, DemoResult, play
+from worker.cli.options import add_config_argument
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -101,6 +102,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     ):
         usual = getattr(DemoConfig, name.replace("-", "_"))
         parser.add_argument(f"--{name}", type=int, help=f"{told} (avoid: {usual})")
+    add_config_argument(parser, "JSON file with settings of the round that publishes")
     parser.add_argument(
         "--flip-rate",
         type=float,

@@ -52,6 +52,8 @@ class DemoConfig:
     evaluation_episodes: int = 400
     comparison_updates: int = 10  # full-batch updates of literal RoDiF and DP-DPO
     seed: int = 0
+    # Settings of the round that publishes, by their names in FinetuneConfig; others are as usual.
+    config: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # All of these are looked at before anything starts, not when the loop comes to them.
@@ -193,6 +195,7 @@ def run_rounds(
         method=FinetuneMethod.RODIF_GUIDED,
         publish_rule=PublishRule.AUTO,
         evaluation=evaluation,
+        settings=config.config,
     )
     # At once, not one after the other: they start from the policy that is published now.
     started = {FinetuneMethod.RODIF_GUIDED: guided}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import RodifError
+from rodif_core.spec import FinetuneConfig
 
 if TYPE_CHECKING:
     from worker.cli.client import Client
@@ -41,6 +42,29 @@ def connect(args: argparse.Namespace) -> Client:
             " give it with --token or in RODIF_TOKEN"
         )
     return Client(args.url, args.token)
+
+
+def finetune_settings(text: str) -> dict[str, Any]:
+    """Value of `--config`: a JSON file with some settings of the fine-tuner, looked at already.
+
+    Raises ArgumentTypeError naming what the file lacks, or the setting and its legal values.
+    """
+    try:
+        settings: dict[str, Any] = json.loads(Path(text).read_text())
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a readable JSON file: {error}") from None
+    if not isinstance(settings, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} holds {settings!r}, not an object of settings")
+    try:
+        FinetuneConfig.from_json(settings)
+    except RodifError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
+    return settings
+
+
+def add_config_argument(parser: argparse.ArgumentParser, told: str) -> None:
+    """`--config FILE`, into `args.config`."""
+    parser.add_argument("--config", type=finetune_settings, metavar="FILE", help=told)
 
 
 PRINTED = Path("-")  # --json without a file

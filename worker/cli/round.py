@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rodif_core.spec import FinetuneMethod, RolloutConfig
 from server.states import PublishRule
-from worker.cli.options import add_connection_arguments, connect
+from worker.cli.options import add_config_argument, add_connection_arguments, connect
 
 if TYPE_CHECKING:
     from worker.cli.client import Client
@@ -28,10 +28,15 @@ def launch(
     snapshot_digest: str | None = None,
     updates: int | None = None,
     conservativeness: float | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Start a round; what is not given is taken from the campaign. Raises ApiError (409, 422)."""
-    config = {"method": method, "updates": updates, "conservativeness": conservativeness}
-    body: dict[str, Any] = {"config": {k: v for k, v in config.items() if v is not None}}
+    """Start a round; what is not given is taken from the campaign. Raises ApiError (409, 422).
+
+    `settings` are further ones of the fine-tuner, by their names in FinetuneConfig.
+    """
+    given = {"method": method, "updates": updates, "conservativeness": conservativeness}
+    config = {name: value for name, value in given.items() if value is not None}
+    body: dict[str, Any] = {"config": {**(settings or {}), **config}}
     if publish_rule is not None:
         body["publish_rule"] = publish_rule
     if evaluation is not None:
@@ -66,6 +71,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--conservativeness", type=float, help="γ in [0, 1); default: estimated from the labels"
     )
+    add_config_argument(parser, "JSON file with further settings of the fine-tuner")
     parser.add_argument("--snapshot", help="digest of frozen labels to use again")
     parser.add_argument("--json", action="store_true", help="print the finished round as JSON")
     parser.add_argument(
@@ -96,6 +102,7 @@ def run(args: argparse.Namespace) -> int:
             snapshot_digest=args.snapshot,
             updates=args.updates,
             conservativeness=args.conservativeness,
+            settings=args.config,
         )
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
