@@ -34,6 +34,24 @@ def until(page: Page, expression: str, seconds: float = PATIENCE) -> Any:
     return value
 
 
+def boxes(page: Page, selector: str) -> list[dict[str, float]]:
+    """{x, y, width, height} in pixels of all that match and `covered`: 1 where something else lies
+    over the middle.
+
+    One call, where Playwright's own boxes wait for a frame each, which software renders slowly.
+    """
+    found: list[dict[str, float]] = page.evaluate(
+        """(selector) => [...document.querySelectorAll(selector)].map((one) => {
+          const { x, y, width, height } = one.getBoundingClientRect();
+          const top = document.elementFromPoint(x + width / 2, y + height / 2);
+          return { x, y, width, height, covered: one.contains(top) ? 0 : 1 };
+        })""",
+        selector,
+    )
+    assert found, selector
+    return found
+
+
 def sign_in(page: Page, studio: Studio, name: str, path: str) -> None:
     """Go to `path`, be sent to the sign-in page, sign in, and be sent back."""
     page.goto(studio.url + path)

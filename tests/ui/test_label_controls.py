@@ -9,7 +9,7 @@ from playwright.sync_api import Page
 
 from server.states import Choice
 from server.store.tables import Campaign
-from tests.ui.driving import LabelPage, until
+from tests.ui.driving import LabelPage, boxes, until
 from tests.ui.studio import Studio
 
 pytestmark = pytest.mark.browser
@@ -92,11 +92,9 @@ def test_scene_leaves_the_browsers_keys_to_the_browser(studio: Studio, label_pag
     assert swallowed == ["ArrowUp", " ", "Z", "2"]
 
 
-@pytest.mark.parametrize("size", SIZES)
 def test_undo_stays_in_reach_after_its_note_is_gone(
-    studio: Studio, page: Page, label_page: Opened, size: tuple[int, int]
+    studio: Studio, page: Page, label_page: Opened
 ) -> None:
-    page.set_viewport_size({"width": size[0], "height": size[1]})
     campaign = studio.add_campaign([True, True])
     driver = label_page(campaign)
     pair = driver.wait_ready()
@@ -106,8 +104,10 @@ def test_undo_stays_in_reach_after_its_note_is_gone(
     studio.wait_for_labels(campaign, 1)
     driver.wait_ready()
     page.locator("#toast").wait_for(state="hidden")
-    box = button.bounding_box()
-    assert box is not None and box["width"] >= 44 and box["height"] >= 44
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        (box,) = boxes(page, "#undo")
+        assert box["width"] >= 44 and box["height"] >= 44 and not box["covered"], (width, height)
     button.click()
     assert driver.wait_ready() == pair
     assert studio.wait_for_labels(campaign, 2)[1].retracted
@@ -128,13 +128,13 @@ def test_answers_and_runs_stay_in_sight_however_long_the_criterion(
     for width, height in SIZES:
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(100)
-        for choice in page.locator(".choice").all():
-            box = choice.bounding_box()
-            assert box is not None
+        choices = boxes(page, ".choice")
+        assert len(choices) == 4
+        for box in choices:
             assert box["x"] >= 0 and box["x"] + box["width"] <= width
             assert box["y"] >= 0 and box["y"] + box["height"] <= height, (width, height)
-        stage = page.locator("#stage").bounding_box()
-        assert stage is not None and stage["height"] >= 0.33 * height, (width, height)
+        (stage,) = boxes(page, "#stage")
+        assert stage["height"] >= 0.33 * height, (width, height)
         text = page.locator(".criterion")
         until(page, "document.querySelector('.criterion').clientHeight >= 60")
         assert text.evaluate("(box) => box.scrollWidth <= box.clientWidth")
