@@ -30,7 +30,13 @@ SIZES = {
 }
 # A full round is what `make demo` and `rodif bench avoid` show; here it need not be repeated.
 QUICK = {
-    "guide": {"self_training_rounds": 1, "self_training_rollouts": 60, "selection_rollouts": 60}
+    "guide": {
+        "scales": [2.0],
+        "selection_rollouts": 40,
+        "self_training_rounds": 1,
+        "self_training_rollouts": 40,
+        "self_training_updates": 60,
+    }
 }
 RATES = ("success", "alignment", "alignment_of_successes", "off_support")
 

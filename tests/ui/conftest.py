@@ -35,7 +35,8 @@ def browser(playwright: Playwright) -> Iterator[Browser]:
 
 @pytest.fixture
 def context(browser: Browser) -> Iterator[BrowserContext]:
-    made = browser.new_context(viewport={"width": 700, "height": 620})
+    # Replays then wait for Space: playing them, in software, is most of what these tests would do.
+    made = browser.new_context(viewport={"width": 700, "height": 620}, reduced_motion="reduce")
     yield made
     made.close()
 

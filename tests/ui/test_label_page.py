@@ -33,8 +33,9 @@ def test_sign_in_refuses_a_wrong_password_and_returns_to_the_page_asked_for(
 
 
 def test_replay_plays_by_itself_and_obeys_keys_and_the_transport_bar(
-    studio: Studio, label_page: Opened
+    studio: Studio, page: Page, label_page: Opened
 ) -> None:
+    page.emulate_media(reduced_motion="no-preference")
     driver = label_page(studio.add_campaign([True]))
     first = driver.state()["t"]
     driver.wait_state(f"!state.paused && state.t !== {first}")
@@ -62,7 +63,20 @@ def test_replay_plays_by_itself_and_obeys_keys_and_the_transport_bar(
     driver.wait_state("state.paused")
 
 
-def test_camera_buttons_turn_the_scene(studio: Studio, label_page: Opened) -> None:
+def test_replay_waits_for_space_where_the_system_asks_for_less_motion(
+    studio: Studio, page: Page, label_page: Opened
+) -> None:
+    page.emulate_media(reduced_motion="reduce")
+    driver = label_page(studio.add_campaign([True]))
+    begun = driver.wait_state("state.paused")["t"]
+    page.wait_for_timeout(500)
+    assert driver.state()["t"] == begun
+    driver.press("Space")
+    driver.wait_state(f"!state.paused && state.t !== {begun}")
+
+
+def test_camera_buttons_turn_the_scene(studio: Studio, page: Page, label_page: Opened) -> None:
+    page.emulate_media(reduced_motion="no-preference")
     driver = label_page(studio.add_campaign([True]))
     front = driver.wait_state("state.camera !== ''")["camera"]
     driver.press("2")
