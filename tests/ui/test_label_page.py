@@ -125,7 +125,10 @@ def test_labels_by_key_and_mouse_name_the_right_winner_for_both_side_orders(
     assert driver.page.locator("#progress-text").inner_text() == "6 of 6"
 
 
-def test_what_was_watched_is_stored_with_the_label(studio: Studio, label_page: Opened) -> None:
+def test_what_was_watched_is_stored_with_the_label(
+    studio: Studio, page: Page, label_page: Opened
+) -> None:
+    page.emulate_media(reduced_motion="no-preference")
     campaign = studio.add_campaign([True])
     driver = label_page(campaign)
     driver.press("Space")
@@ -145,8 +148,9 @@ def test_what_was_watched_is_stored_with_the_label(studio: Studio, label_page: O
 
 
 def test_arrows_move_the_scrubber_that_the_keyboard_reached(
-    studio: Studio, label_page: Opened
+    studio: Studio, page: Page, label_page: Opened
 ) -> None:
+    page.emulate_media(reduced_motion="no-preference")
     campaign = studio.add_campaign([True])
     driver = label_page(campaign)
     driver.press("Space")
