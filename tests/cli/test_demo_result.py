@@ -80,6 +80,8 @@ def test_sizes_out_of_range_are_named(capsys: pytest.CaptureFixture[str]):
         DemoConfig(pairs=0)
     with pytest.raises(RodifError, match="evaluation_episodes is 0"):
         DemoConfig(evaluation_episodes=0)
+    with pytest.raises(RodifError, match="method is 'dp_dpo', but must be 'rodif_guided'"):
+        DemoConfig(finetune={"method": "dp_dpo"})
     assert main(["demo", "--headless", "--labels", "0"]) == 1
     assert "labels is 0, but must be at least 1" in capsys.readouterr().err
 

@@ -34,17 +34,23 @@ def until(page: Page, expression: str, seconds: float = PATIENCE) -> Any:
     return value
 
 
-def boxes(page: Page, selector: str) -> list[dict[str, float]]:
-    """{x, y, width, height} in pixels of all that match and `covered`: 1 where something else lies
-    over the middle.
+def resize(page: Page, width: int, height: int) -> None:
+    """Give the page this size, and wait until it has it."""
+    page.set_viewport_size({"width": width, "height": height})
+    until(page, f"innerWidth === {width} && innerHeight === {height}")
+
+
+def boxes(page: Page, selector: str) -> list[dict[str, Any]]:
+    """{x, y, width, height, on_top} of all that match: pixels, and whether the middle is on the
+    screen with nothing over it.
 
     One call, where Playwright's own boxes wait for a frame each, which software renders slowly.
     """
-    found: list[dict[str, float]] = page.evaluate(
+    found: list[dict[str, Any]] = page.evaluate(
         """(selector) => [...document.querySelectorAll(selector)].map((one) => {
           const { x, y, width, height } = one.getBoundingClientRect();
           const top = document.elementFromPoint(x + width / 2, y + height / 2);
-          return { x, y, width, height, covered: one.contains(top) ? 0 : 1 };
+          return { x, y, width, height, on_top: one.contains(top) };
         })""",
         selector,
     )

@@ -9,7 +9,7 @@ from playwright.sync_api import Page
 
 from server.states import Choice
 from server.store.tables import Campaign
-from tests.ui.driving import LabelPage, boxes, until
+from tests.ui.driving import LabelPage, boxes, resize, until
 from tests.ui.studio import Studio
 
 pytestmark = pytest.mark.browser
@@ -105,9 +105,9 @@ def test_undo_stays_in_reach_after_its_note_is_gone(
     driver.wait_ready()
     page.locator("#toast").wait_for(state="hidden")
     for width, height in SIZES:
-        page.set_viewport_size({"width": width, "height": height})
+        resize(page, width, height)
         (box,) = boxes(page, "#undo")
-        assert box["width"] >= 44 and box["height"] >= 44 and not box["covered"], (width, height)
+        assert box["width"] >= 44 and box["height"] >= 44 and box["on_top"], (width, height)
     button.click()
     assert driver.wait_ready() == pair
     assert studio.wait_for_labels(campaign, 2)[1].retracted
@@ -126,8 +126,7 @@ def test_answers_and_runs_stay_in_sight_however_long_the_criterion(
     driver = LabelPage(page, studio, studio.add_annotator())
     driver.open(campaign, ready=False)
     for width, height in SIZES:
-        page.set_viewport_size({"width": width, "height": height})
-        page.wait_for_timeout(100)
+        resize(page, width, height)
         choices = boxes(page, ".choice")
         assert len(choices) == 4
         for box in choices:

@@ -68,7 +68,9 @@ def test_replay_waits_for_space_where_the_system_asks_for_less_motion(
 ) -> None:
     page.emulate_media(reduced_motion="reduce")
     driver = label_page(studio.add_campaign([True]))
-    begun = driver.wait_state("state.paused")["t"]
+    driver.wait_state("state.paused")
+    page.wait_for_timeout(500)  # whatever was under way when it was paused has come by then
+    begun = driver.state()["t"]
     page.wait_for_timeout(500)
     assert driver.state()["t"] == begun
     driver.press("Space")

@@ -53,7 +53,7 @@ class DemoConfig:
     comparison_updates: int = 10  # full-batch updates of literal RoDiF and DP-DPO
     seed: int = 0
     # Settings of the round that publishes, by their names in FinetuneConfig; others are as usual.
-    config: Mapping[str, Any] = field(default_factory=dict)
+    finetune: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # All of these are looked at before anything starts, not when the loop comes to them.
@@ -63,6 +63,11 @@ class DemoConfig:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
         if not 0 <= self.flip_rate < 0.5:
             raise ValueOutOfRangeError("flip_rate", self.flip_rate, "in [0, 0.5)")
+        method = self.finetune.get("method", FinetuneMethod.RODIF_GUIDED.value)
+        if method != FinetuneMethod.RODIF_GUIDED.value:
+            raise ValueOutOfRangeError(
+                "method", method, f"{FinetuneMethod.RODIF_GUIDED.value!r}; the others run beside it"
+            )
 
     @classmethod
     def for_task(cls, task: Task) -> DemoConfig:
@@ -195,7 +200,7 @@ def run_rounds(
         method=FinetuneMethod.RODIF_GUIDED,
         publish_rule=PublishRule.AUTO,
         evaluation=evaluation,
-        settings=config.config,
+        settings=config.finetune,
     )
     # At once, not one after the other: they start from the policy that is published now.
     started = {FinetuneMethod.RODIF_GUIDED: guided}

@@ -63,8 +63,10 @@ def finetune_settings(text: str) -> dict[str, Any]:
 
 
 def add_config_argument(parser: argparse.ArgumentParser, told: str) -> None:
-    """`--config FILE`, into `args.config`."""
-    parser.add_argument("--config", type=finetune_settings, metavar="FILE", help=told)
+    """`--config FILE`, into `args.finetune`."""
+    parser.add_argument(
+        "--config", dest="finetune", type=finetune_settings, metavar="FILE", help=told
+    )
 
 
 PRINTED = Path("-")  # --json without a file

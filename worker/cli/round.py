@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
             snapshot_digest=args.snapshot,
             updates=args.updates,
             conservativeness=args.conservativeness,
-            settings=args.config,
+            settings=args.finetune,
         )
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
