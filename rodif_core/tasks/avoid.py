@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.spec import TaskName
-from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View
+from rodif_core.tasks.base import FINISHED, REASONS, Array, Context, Task, View, read_numbers
 from rodif_core.tasks.panda import CONTROL_DT, OBJECT_BIT, TOOL_BIT, Mesh, rod_scene
 
 # Rows of cylinders in the order of travel: (x, y, radius) in metres, left (small x) to right.
@@ -99,20 +99,13 @@ class AvoidTask(Task):
         return {"start": [float(start[0]), float(start[1])]}
 
     def start_point(self, context: Context) -> Array:
-        start = context.get("start")
         legal = (
             f"[x, y] in metres with x in [{MIN_X}, {MAX_X}], y in [{MIN_Y}, -0.15] "
             f"and {MIN_REACH} to {MAX_REACH} from the robot's base"
         )
-        try:
-            point = np.array(start, dtype=np.float64)
-        except (TypeError, ValueError):
-            point = np.empty(0)
-        if point.shape != (2,) or not np.isfinite(point).all() or point[1] > -0.15:
-            raise ValueOutOfRangeError("start", start, legal)
-        point = np.append(point, ROD_HEIGHT)
-        if not self._within(point[None])[0]:
-            raise ValueOutOfRangeError("start", start, legal)
+        point = np.append(read_numbers(context, "start", 2, legal), ROD_HEIGHT)
+        if point[1] > -0.15 or not self._within(point[None])[0]:
+            raise ValueOutOfRangeError("start", context["start"], legal)
         return point
 
     def group_of(self, mode: str) -> str:

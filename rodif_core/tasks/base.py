@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.spec import TaskName
 from rodif_core.tasks.control import Control, RodControl
 from rodif_core.tasks.panda import ARM_JOINTS, Mesh
@@ -160,3 +161,15 @@ class Task(ABC):
     @abstractmethod
     def scene_shapes(self) -> list[dict[str, Any]]:
         """Facts for top-down plots, as JSON types; see the task for the shapes' keys."""
+
+
+def read_numbers(context: Context, name: str, count: int, legal: str) -> Array:
+    """`count` finite numbers of a context; raises ValueOutOfRangeError naming `legal`."""
+    value = context.get(name)
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueOutOfRangeError(name, value, legal)
+    return numbers

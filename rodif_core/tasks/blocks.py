@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rodif_core.errors import ValueOutOfRangeError
-from rodif_core.tasks.base import Array, Context
+from rodif_core.tasks.base import Array, Context, read_numbers
 from rodif_core.tasks.panda import ROD_GEOM, TABLE_GEOM, Mesh, rod_scene
 
 Range = tuple[float, float]
@@ -88,18 +88,6 @@ def _apart(places: Sequence[Sequence[float]], distance: float) -> bool:
         np.hypot(one[0] - other[0], one[1] - other[1]) >= distance
         for one, other in combinations(places, 2)
     )
-
-
-def read_numbers(context: Context, name: str, count: int, legal: str) -> Array:
-    """`count` finite numbers of a context; raises ValueOutOfRangeError naming `legal`."""
-    value = context.get(name)
-    try:
-        numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise ValueOutOfRangeError(name, value, legal)
-    return numbers
 
 
 def read_start(context: Context, height: float, start: tuple[float, float]) -> Array:
