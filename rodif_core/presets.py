@@ -157,13 +157,19 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         "updates": 25_000,
     },
     ("pushing", "paper"): {"executed_steps": 4},
-    ("sorting", "cpu"): {"executed_steps": 4, "updates": 30_000},
+    ("sorting", "cpu"): {
+        "executed_steps": 4,
+        "updates": 30_000,
+        "rounds": 2,
+        "recoveries": 600,
+    },
     ("sorting", "paper"): {"executed_steps": 4},
     ("aligning-state", "cpu"): {"updates": 30_000},
     ("aligning", "cpu"): {
         "images": ImageConfig(),
-        "encoder": EncoderConfig(moments=12_000, updates=3_000),
+        "encoder": EncoderConfig(moments=24_000, updates=4_000),
         "updates": 20_000,
+        "rounds": 2,
     },
     ("stacking", "cpu"): {
         "images": ImageConfig(),

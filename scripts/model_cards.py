@@ -24,7 +24,7 @@ PAPER_SUCCESS = {"avoid": 78, "pushing": 58, "sorting": 82, "aligning": 5, "stac
 CPU_MINUTES = {
     "avoid": 10,
     "pushing": 33,
-    "sorting": 55,
+    "sorting": 90,
     "aligning": 30,
     "aligning-state": 9,
     "stacking": 150,
