@@ -25,7 +25,7 @@ CPU_MINUTES = {
     "avoid": 10,
     "pushing": 33,
     "sorting": 90,
-    "aligning": 30,
+    "aligning": 55,
     "aligning-state": 9,
     "stacking": 150,
     "stacking-state": 50,
