@@ -8,8 +8,9 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig
 from rodif_core.policies.resnet import ImageEncoder
 from rodif_core.presets import PretrainConfig
-from rodif_core.spec import TaskName
+from rodif_core.rollout import rollout
+from rodif_core.spec import RolloutConfig, TaskName
 from rodif_core.tasks import get_task
 from rodif_core.training_state import (
     Precision,
@@ -46,6 +48,10 @@ from rodif_core.trajectory import Trajectory
 
 SAVE_EVERY = 500  # updates between partial states
 REPORT_EVERY = 100  # updates between held-out losses
+TRACKED_AT = (0.2, 0.4, 0.6, 0.8)  # shares of a training after which rollouts look at the policy
+TRACKED_SEED = 400_000_000  # of those rollouts, apart from those of demonstrations and measurements
+
+SuccessOf = Callable[[DiffusionPolicy], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +90,7 @@ def pretrain(
     kept_rows: Path | None = None,
     device: str = "cpu",
     precision: Precision | None = None,
+    track: int = 0,
     progress: UpdateProgress | None = None,
 ) -> Checkpoint:
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
@@ -92,6 +99,8 @@ def pretrain(
                instead of from fresh weights for `config.updates`
     kept_rows  folder for encoded pictures, which trainings with the same encoder may share
     precision  of the forward passes; by default mixed on a GPU
+    track      rollouts of the policy after every fifth of the training; their success goes to
+               `progress` and to the card's rollout_curve, the weights do not depend on them
 
     The result holds the averaged weights, the normaliser and the support set. Raises
     LearningError for fewer than two demonstrations, when the loss is not finite or the workspace
@@ -115,21 +124,22 @@ def pretrain(
     shape = config.policy_config(task) if start is None else start.policy.config
     seen, unseen = (encode(task, shape, encoder, part, kept_rows) for part in (known, held_out))
     policy = _fresh(shape, seen, encoder, config) if start is None else start.policy.copy()
-    average, curve = _train(
+    support = _support(known, held_out, policy)
+    average, curves = _train(
         policy,
-        Windows.cut(seen, shape, policy.normaliser),
-        Windows.cut(unseen, shape, policy.normaliser),
+        seen,
+        unseen,
         config if start is None else replace(config, updates=config.round_updates),
         workspace,
         device,
         precision,
+        partial(_success, task_name, support, track) if track else None,
         progress,
     )
-    policy = replace(policy, denoiser=average)
-    curves = {"held_out_curve": curve, "encoder_curve": encoder_curve}
+    curves["encoder_curve"] = encoder_curve
     facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
     card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
-    return Checkpoint(task_name, policy, _support(known, held_out, policy), card)
+    return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
 
 
 def _split(
@@ -189,14 +199,17 @@ def _fresh(
 
 def _train(
     policy: DiffusionPolicy,
-    rows: Windows,
-    held_out: Windows,
+    known: Sequence[Trajectory],
+    unknown: Sequence[Trajectory],
     config: PretrainConfig,
     workspace: Path | None,
     device: str,
     precision: Precision,
+    success_of: SuccessOf | None,
     progress: UpdateProgress | None,
-) -> tuple[Any, list[dict[str, float]]]:
+) -> tuple[Any, dict[str, Any]]:
+    """The averaged denoiser, and the curves on the way to it."""
+    rows, held_out = (Windows.cut(d, policy.config, policy.normaliser) for d in (known, unknown))
     model = policy.denoiser.to(device)
     average = copy.deepcopy(model)
     optimizer = torch.optim.AdamW(
@@ -205,23 +218,17 @@ def _train(
     state_file = workspace / "pretrain.safetensors" if workspace is not None else None
     modules: dict[str, nn.Module] = {"model": model, "average": average}
     facts = load_state(state_file, modules, optimizer) if state_file is not None else None
-    start, curve = (facts["update"], facts["curve"]) if facts else (0, [])
+    start, curve, tracked = 0, [], []
+    if facts:
+        start, curve, tracked = facts["update"], facts["curve"], facts.get("tracked", [])
+    looks = {round(share * config.updates) for share in TRACKED_AT} if success_of else set()
     histories, chunks = rows.histories.to(device), rows.chunks.to(device)
     for update in range(start, config.updates):
-        # A generator per update: a resumed run draws the same batches as an unbroken one.
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
-        for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * cosine_rate(update, config.warm_up, config.updates)
-        pick = torch.randint(len(chunks), (config.batch_size,), generator=generator).to(device)
-        with forward_precision(device, precision):
-            loss = _noise_loss(policy, model, histories[pick], chunks[pick], generator)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
+        loss = _update(policy, model, optimizer, histories, chunks, config, update, precision)
         update_average(average, model, min(config.ema_decay, (1 + update) / (10 + update)))
         if update % REPORT_EVERY == 0 or update == config.updates - 1:
             metrics = {
-                "loss": float(loss.detach()),
+                "loss": float(loss),
                 "held_out": _held_out_loss(policy, average, held_out),
             }
             if not math.isfinite(metrics["loss"]):
@@ -229,9 +236,51 @@ def _train(
             curve.append({"update": float(update), **metrics})
             if progress is not None:
                 progress(update + 1, config.updates, metrics)
+        if success_of is not None and update + 1 in looks:
+            seen = copy.deepcopy(average).cpu().eval()
+            success = success_of(replace(policy, denoiser=seen))
+            tracked.append({"update": float(update + 1), "success": success})
+            if progress is not None:
+                progress(update + 1, config.updates, tracked[-1])
         if state_file is not None and (update + 1) % SAVE_EVERY == 0:
-            save_state(state_file, modules, optimizer, {"update": update + 1, "curve": curve})
-    return average.cpu().eval(), curve
+            facts = {"update": update + 1, "curve": curve, "tracked": tracked}
+            save_state(state_file, modules, optimizer, facts)
+    return average.cpu().eval(), {"held_out_curve": curve, "rollout_curve": tracked}
+
+
+def _update(
+    policy: DiffusionPolicy,
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    histories: Tensor,
+    chunks: Tensor,
+    config: PretrainConfig,
+    update: int,
+    precision: Precision,
+) -> Tensor:
+    """One step of the optimiser on a batch; returns its loss."""
+    # A generator per update: a resumed run draws the same batches as an unbroken one.
+    generator = torch.Generator().manual_seed(config.seed * 1_000_003 + update)
+    for group in optimizer.param_groups:
+        group["lr"] = config.learning_rate * cosine_rate(update, config.warm_up, config.updates)
+    device = chunks.device
+    pick = torch.randint(len(chunks), (config.batch_size,), generator=generator).to(device)
+    with forward_precision(device.type, precision):
+        loss = _noise_loss(policy, model, histories[pick], chunks[pick], generator)
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    optimizer.step()
+    return loss.detach()
+
+
+def _success(
+    task_name: TaskName, support: SupportSet, episodes: int, policy: DiffusionPolicy
+) -> float:
+    """Share of fresh rollouts in which the policy succeeds; always the same starts."""
+    runs = rollout(
+        Checkpoint(task_name, policy, support, {}), RolloutConfig(episodes, TRACKED_SEED)
+    )
+    return sum(one.success for one in runs) / episodes
 
 
 def _noise_loss(

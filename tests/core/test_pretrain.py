@@ -157,6 +157,25 @@ def test_a_device_that_is_not_there_is_refused(demonstrations: list[Trajectory])
         pretrain(TaskName.AVOID, demonstrations, CONFIG, device="tpu")
 
 
+def test_tracking_tells_success_on_the_way_and_changes_no_weights(
+    demonstrations: list[Trajectory],
+) -> None:
+    told: list[tuple[int, dict[str, float]]] = []
+    tracked = pretrain(
+        TaskName.AVOID, demonstrations, CONFIG, track=3,
+        progress=lambda done, _, metrics: told.append((done, metrics)),
+    )  # fmt: skip
+    curve = tracked.card["rollout_curve"]
+    assert [point["update"] for point in curve] == [6, 12, 18, 24]
+    assert all(
+        point["success"] * 3 == pytest.approx(round(point["success"] * 3)) for point in curve
+    )
+    assert [metrics for _, metrics in told if "success" in metrics] == curve
+    untracked = pretrain(TaskName.AVOID, demonstrations, CONFIG)
+    assert untracked.digest == tracked.digest
+    assert untracked.card["rollout_curve"] == []
+
+
 def test_killed_pretraining_goes_on_to_the_same_weights(
     demonstrations: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,10 +190,11 @@ def test_killed_pretraining_goes_on_to_the_same_weights(
             raise KilledError
 
     with pytest.raises(KilledError):
-        pretrain(TaskName.AVOID, demonstrations, CONFIG, workspace=tmp_path, progress=kill)
-    resumed = pretrain(TaskName.AVOID, demonstrations, CONFIG, workspace=tmp_path)
-    whole = pretrain(TaskName.AVOID, demonstrations, CONFIG)
+        pretrain(TaskName.AVOID, demonstrations, CONFIG, workspace=tmp_path, track=2, progress=kill)
+    resumed = pretrain(TaskName.AVOID, demonstrations, CONFIG, workspace=tmp_path, track=2)
+    whole = pretrain(TaskName.AVOID, demonstrations, CONFIG, track=2)
     assert resumed.digest == whole.digest
+    assert resumed.card["rollout_curve"] == whole.card["rollout_curve"]
 
 
 def test_a_workspace_of_another_training_is_refused_and_kept(

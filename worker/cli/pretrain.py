@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.presets import PretrainConfig
+    from rodif_core.training_state import UpdateProgress
 
 # Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
 RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
@@ -64,14 +65,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--workspace", type=Path, help="keeps partial state; a broken run goes on from there"
     )
     parser.add_argument(
+        "--track",
+        type=int,
+        default=50,
+        help="rollouts after every fifth of a training, which tell how far it is; 0 for none"
+        " (default %(default)s)",
+    )
+    parser.add_argument(
         "--evaluate", type=int, default=500, help="rollouts of the final measurement, 0 for none"
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Demonstrate, train, let the expert take over and train again, measure, write."""
-    if args.evaluate < 0:
-        raise ValueOutOfRangeError("evaluate", args.evaluate, "at least 0")
+    for name in ("evaluate", "track"):
+        if getattr(args, name) < 0:
+            raise ValueOutOfRangeError(name, getattr(args, name), "at least 0")
 
     from rich.console import Console
     from rich.progress import Progress
@@ -125,12 +134,6 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         updates = config.round_updates if number else config.updates
         training = bar.add_task(f"training {number}", total=updates)
 
-        def show(done: int, of: int, metrics: dict[str, float], row: TaskID = training) -> None:
-            shown = {name: value for name, value in metrics.items() if name != "update"}
-            losses = ", ".join(f"{name} {value:.4f}" for name, value in shown.items())
-            # The encoder of a task with cameras trains first, and has a length of its own.
-            bar.update(row, completed=done, total=of, description=f"training ({losses})")
-
         workspace = None
         if args.workspace is not None:
             workspace = args.workspace / f"round-{number}"
@@ -144,7 +147,8 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
             precision=Precision(args.precision) if args.precision else None,
-            progress=show,
+            track=args.track,
+            progress=_showing(bar, training, args.track),
         )
         bar.update(training, total=updates, completed=updates)  # also one that was done before
     assert checkpoint is not None
@@ -154,6 +158,21 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         "success_before_rounds": on_the_way,
     }
     return replace(checkpoint, card=checkpoint.card | facts)
+
+
+def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
+    """Shows a training's progress in a row of the bar, and above it what rollouts say."""
+
+    def show(done: int, of: int, metrics: dict[str, float]) -> None:
+        if "success" in metrics:
+            told = f"success {metrics['success']:.1%} (n = {tracked})"
+            bar.console.print(f"after {done:,} of {of:,} updates: {told}")
+            return
+        losses = ", ".join(f"{k} {value:.4f}" for k, value in metrics.items() if k != "update")
+        # The encoder of a task with cameras trains first, and has a length of its own.
+        bar.update(row, completed=done, total=of, description=f"training ({losses})")
+
+    return show
 
 
 def _measure(checkpoint: Checkpoint, episodes: int, bar: Progress) -> Checkpoint:
