@@ -111,18 +111,22 @@ def test_pretrain_writes_a_checkpoint_with_its_measurements(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     file = tmp_path / "deep" / "new.safetensors"
-    sizes = ["--demonstrations", "24", "--updates", "3", "--evaluate", "4"]
+    sizes = ["--demonstrations", "24", "--updates", "5", "--track", "2", "--evaluate", "4"]
     assert main(["pretrain", "avoid", "--out", str(file), *sizes, "--seed", "5"]) == 0
     made = load_checkpoint(file.read_bytes())
     assert made.card["evaluation"]["n"] == 4
     assert made.card["demonstrations"] == 24
-    assert made.digest in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert made.digest in told.out
+    first, *_, last = made.card["rollout_curve"]
+    assert (first["update"], last["update"]) == (1, 4)
+    assert f"after 4 of 5 updates: success {last['success']:.1%} (n = 2)" in told.err
 
 
 @pytest.mark.slow
 def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path: Path):
     file = tmp_path / "new.safetensors"
-    sizes = ["--demonstrations", "4", "--updates", "2", "--evaluate", "0"]
+    sizes = ["--demonstrations", "4", "--updates", "2", "--track", "0", "--evaluate", "0"]
     rounds = ["--rounds", "1", "--recoveries", "4", "--round-updates", "3", "--executed-steps", "4"]
     work = ["--workspace", str(tmp_path / "work")]
     assert main(["pretrain", "pushing", "--out", str(file), *sizes, *rounds, *work]) == 0
@@ -135,7 +139,7 @@ def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path
     assert made.card["held_out_curve"][-1]["update"] == 2  # the last of three
 
 
-@pytest.mark.parametrize("option", ["--rounds", "--evaluate"])
+@pytest.mark.parametrize("option", ["--rounds", "--track", "--evaluate"])
 def test_pretrain_refuses_negative_numbers(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
