@@ -99,8 +99,8 @@ def pretrain(
                instead of from fresh weights for `config.updates`
     kept_rows  folder for encoded pictures, which trainings with the same encoder may share
     precision  of the forward passes; by default mixed on a GPU
-    track      rollouts of the policy after every fifth of the training; their success goes to
-               `progress` and to the card's rollout_curve, the weights do not depend on them
+    track      rollouts of the policy after each of the first four fifths of the training; their
+               success goes to `progress` and to the card's rollout_curve, not into the weights
 
     The result holds the averaged weights, the normaliser and the support set. Raises
     LearningError for fewer than two demonstrations, when the loss is not finite or the workspace
@@ -136,7 +136,7 @@ def pretrain(
         partial(_success, task_name, support, track) if track else None,
         progress,
     )
-    curves["encoder_curve"] = encoder_curve
+    curves |= _earlier_curves(start) if start else {"encoder_curve": encoder_curve}
     facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
     card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
     return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
@@ -164,6 +164,16 @@ def _deciding(config: PretrainConfig) -> dict[str, Any]:
     """What decides the result of one training; how many follow it does not, so that a finished
     series can have another round."""
     return {k: v for k, v in asdict(config).items() if k not in ("rounds", "recoveries")}
+
+
+def _earlier_curves(start: Checkpoint) -> dict[str, Any]:
+    """What the card of a policy that another one goes on from says about its trainings."""
+    names = ("held_out_curve", "rollout_curve")
+    before = {name: start.card[name] for name in names if name in start.card}
+    return {
+        "encoder_curve": start.card.get("encoder_curve"),
+        "earlier_curves": [*start.card.get("earlier_curves", []), before],
+    }
 
 
 def _fingerprint(demonstrations: Sequence[Trajectory]) -> str:

@@ -176,6 +176,22 @@ def test_tracking_tells_success_on_the_way_and_changes_no_weights(
     assert untracked.card["rollout_curve"] == []
 
 
+def test_a_card_keeps_the_curves_of_the_trainings_before(
+    demonstrations: list[Trajectory],
+) -> None:
+    config = replace(CONFIG, round_updates=5)
+    first = pretrain(TaskName.AVOID, demonstrations, config, track=1)
+    first = replace(first, card=first.card | {"encoder_curve": [{"update": 0.0, "loss": 1.0}]})
+    second = pretrain(TaskName.AVOID, demonstrations, config, start=first)
+    third = pretrain(TaskName.AVOID, demonstrations, config, start=second)
+    names = ("held_out_curve", "rollout_curve")
+    assert third.card["earlier_curves"] == [
+        {name: one.card[name] for name in names} for one in (first, second)
+    ]
+    assert len(third.card["earlier_curves"][0]["rollout_curve"]) == 4
+    assert third.card["encoder_curve"] == first.card["encoder_curve"]
+
+
 def test_killed_pretraining_goes_on_to_the_same_weights(
     demonstrations: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -68,8 +68,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--track",
         type=int,
         default=50,
-        help="rollouts after every fifth of a training, which tell how far it is; 0 for none"
-        " (default %(default)s)",
+        help="rollouts after each of the first four fifths of a training, which tell how far it"
+        " is; 0 for none (default %(default)s)",
     )
     parser.add_argument(
         "--evaluate", type=int, default=500, help="rollouts of the final measurement, 0 for none"
