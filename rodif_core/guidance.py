@@ -1,6 +1,6 @@
 """Guided denoising: the second half of `rodif_guided`.
 
-On the decision steps of kept trajectories, with fresh noise ε in the executed chunk, the network
+On the decision steps of kept trajectories, with fresh noise ε in what was done next, the network
 regresses on ε_ref + s (ε - ε_ref), where ε_ref is the frozen reference's prediction. s = 1 is
 imitation of the kept trajectories; s > 1 goes past them, away from the reference. It is a bounded
 least-squares target: unlike a log-ratio it cannot run away.

@@ -84,11 +84,12 @@ def finetune_guided(
         checkpoint, trajectories, preferences, transitions, matrix, config,
         ties=ties, workspace=workspace, progress=progress,
     )  # fmt: skip
+    kept = [trajectories[i] for i in scores.kept]
     this = _Run(checkpoint, scores, config, workspace, progress)
     base = _try(this, "base", checkpoint.policy, 0.0)
     trials: list[Trial] = []
     for scale in config.guide.scales:
-        trials.append(_guide(this, transitions, scale))
+        trials.append(_guide(this, kept, scale))
         this.tell("choose", len(trials) / len(config.guide.scales), trials[-1])
     chosen = choose(base, trials)
     retrained: list[Trial] = []
@@ -109,23 +110,36 @@ def finetune_guided(
     return chosen.policy, report
 
 
-def _guide(this: _Run, transitions: Transitions, scale: float) -> Trial:
-    """Move towards the kept trajectories' decisions by one scale."""
+def _guide(this: _Run, kept: Sequence[Trajectory], scale: float) -> Trial:
+    """Move towards what was done in the kept trajectories by one scale."""
     name = f"guide s={scale:g}"
     done = _load_trial(this, name)
     if done is not None:
         return done
-    histories, chunks = _kept_decisions(transitions, this.scores.kept)
+    policy = this.checkpoint.policy
     policy = guide(
-        this.checkpoint.policy, histories, chunks, scale, this.config.guide, this.config.seed,
+        policy, *decisions_done(policy, kept), scale, this.config.guide, this.config.seed,
         this.stage(name),
     )  # fmt: skip
     return _try(this, name, policy, scale)
 
 
-def _kept_decisions(transitions: Transitions, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
-    rows = torch.tensor([row for i in kept for row in transitions.steps_of(i)])
-    return transitions.histories[rows], transitions.chains[rows, -1]
+def decisions_done(
+    policy: DiffusionPolicy, trajectories: Sequence[Trajectory]
+) -> tuple[Tensor, Tensor]:
+    """histories (N, To, O) of all decisions, and the actions done from each on (N, Tp, A), the last
+    one again after the end; both normalised.
+
+    A decision's own chunk is executed in its first Te steps; what came of the others was decided
+    later, nearer to them and looking again. That is the better thing to plan.
+    Raises LearningError as `stack_decisions` does.
+    """
+    histories, _ = stack_decisions(policy, trajectories)
+    chunks = []
+    for one in trajectories:
+        steps = one.decision_steps[:, None] + np.arange(policy.config.predicted_steps)
+        chunks.append(one.actions[steps.clip(max=len(one.actions) - 1)])
+    return histories, policy.normaliser.action(torch.from_numpy(np.concatenate(chunks)))
 
 
 def _try(this: _Run, name: str, policy: DiffusionPolicy, scale: float) -> Trial:
@@ -191,9 +205,8 @@ def _self_train(this: _Run, base: Trial, chosen: Trial, extra: int) -> Trial | N
     liked = near_data(checkpoint, _liked(this, steady), base.off_support)
     if not liked:
         return None
-    histories, chains = stack_decisions(checkpoint.policy, liked)
     policy = guide(
-        chosen.policy, histories, chains[:, -1], IMITATION,
+        chosen.policy, *decisions_done(checkpoint.policy, liked), IMITATION,
         replace(guiding, updates=guiding.self_training_updates),
         this.config.seed + extra + 1, this.stage(name),
     )  # fmt: skip

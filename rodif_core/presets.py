@@ -39,6 +39,7 @@ class PretrainConfig:
     ema_decay: float = 0.999
     rounds: int = 0  # of training again, on what experts did after they took over
     recoveries: int = 300  # takeovers tried a round
+    drives: int = 1  # rollouts for each of them; from 2 on, failures and every group get as many
     round_updates: int = 8_000
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
@@ -52,7 +53,8 @@ class PretrainConfig:
             raise ValueOutOfRangeError("learning_rate", self.learning_rate, "in (0, 1]")
         if not 0 <= self.ema_decay < 1:
             raise ValueOutOfRangeError("ema_decay", self.ema_decay, "in [0, 1)")
-        least = {"updates": 1, "round_updates": 1, "recoveries": 1, "rounds": 0, "batch_size": 1}
+        least = {"updates": 1, "round_updates": 1, "recoveries": 1, "drives": 1}
+        least |= {"rounds": 0, "batch_size": 1}
         for name, value in (least | {"warm_up": 0, "weight_decay": 0}).items():
             if getattr(self, name) < value:
                 raise ValueOutOfRangeError(name, getattr(self, name), f"at least {value}")

@@ -163,7 +163,8 @@ def _split(
 def _deciding(config: PretrainConfig) -> dict[str, Any]:
     """What decides the result of one training; how many follow it does not, so that a finished
     series can have another round."""
-    return {k: v for k, v in asdict(config).items() if k not in ("rounds", "recoveries")}
+    following = ("rounds", "recoveries", "drives")
+    return {k: v for k, v in asdict(config).items() if k not in following}
 
 
 def _earlier_curves(start: Checkpoint) -> dict[str, Any]:

@@ -35,29 +35,50 @@ class _Takeover:
 
 
 def make_recoveries(
-    task: Task, driven: Sequence[Trajectory], preferred_share: float | None = None
+    task: Task,
+    driven: Sequence[Trajectory],
+    preferred_share: float | None = None,
+    count: int | None = None,
 ) -> list[Trajectory]:
     """What experts did after they took over from the policy, where it led to success.
 
-    Each of the rollouts `driven` is driven again up to a step drawn from those that the policy
-    lasted, and the expert goes on from there. Takeovers that it cannot save are left out. A
-    trajectory begins at the takeover; its context is that of the whole episode, and
-    info["taken_over_at"] tells the step.
+    A rollout of `driven` is driven again up to a step drawn from those that the policy lasted, and
+    the expert goes on from there. Takeovers that it cannot save are left out. A trajectory begins
+    at the takeover; its context is that of the whole episode, and info["taken_over_at"] tells the
+    step.
 
     preferred_share  share of the task's preferred group where the policy has not chosen yet, by
                      default the task's own
+    count            takeovers tried, as many from the failures as from the successes of each group
+                     (from one rollout several, at other steps); by default one a rollout
     """
     shares = mode_shares(task, task.preferred_share if preferred_share is None else preferred_share)
+    asked = [(one, 0) for one in driven] if count is None else _spread(driven, count)
     made: list[Trajectory] = []
-    for first in range(0, len(driven), PARALLEL):
-        takeovers = [_draw(task, one, shares) for one in driven[first : first + PARALLEL]]
+    for first in range(0, len(asked), PARALLEL):
+        takeovers = [_draw(task, one, again, shares) for one, again in asked[first:][:PARALLEL]]
         made += _recover(task, takeovers)
     return made
 
 
-def _draw(task: Task, driven: Trajectory, shares: Array) -> _Takeover:
+def _spread(driven: Sequence[Trajectory], count: int) -> list[tuple[Trajectory, int]]:
+    """`count` rollouts, and how often each was chosen before: evenly from the failures and from
+    the successes of each group, in turn, each of them again from its first on."""
+    kinds: dict[str | None, list[Trajectory]] = {}
+    for one in driven:
+        kinds.setdefault(one.outcome["group"] if one.success else None, []).append(one)
+    chosen = []
+    for number in range(count):
+        turn, place = divmod(number, len(kinds))
+        kind = list(kinds.values())[place]
+        again, index = divmod(turn, len(kind))
+        chosen.append((kind[index], again))
+    return chosen
+
+
+def _draw(task: Task, driven: Trajectory, again: int, shares: Array) -> _Takeover:
     # A stream of its own, apart from the episode's start and the policy's noise.
-    rng = np.random.default_rng([driven.info["seed"], 2])
+    rng = np.random.default_rng([driven.info["seed"], 2, *([again] if again else [])])
     latest = min(len(driven.actions), int(LATEST * task.max_steps))
     step = int(rng.integers(1, latest)) if latest > 1 else 0
     return _Takeover(driven, step, _likeliest_expert(task, driven, step, shares, rng))

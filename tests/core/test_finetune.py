@@ -16,7 +16,7 @@ from rodif_core.drift import SupportSet
 from rodif_core.errors import LearningError
 from rodif_core.finetune import finetune
 from rodif_core.guidance import guidance_target, guide
-from rodif_core.guided import near_data
+from rodif_core.guided import decisions_done, near_data
 from rodif_core.log_ratio import PairMatrix, Transitions
 from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.scoring import TIE_SD, PathFeatures, PathUtility, split_threshold, standardise
@@ -313,6 +313,23 @@ def test_self_training_is_believed_unless_it_is_clearly_worse() -> None:
     assert improves(base, before, trial(1.0, 0.94, 0.02, 0.94))
     assert not improves(base, before, trial(1.0, 0.85, 0.02, 0.85))
     assert not improves(base, before, trial(1.0, 0.99, 0.2, 0.99))
+
+
+def test_imitated_is_what_was_done_in_the_steps_after_a_decision() -> None:
+    policy = tiny_policy()
+    short = chain_trajectory(policy, 3, seed=1)
+    steps = np.arange(len(short.actions), dtype=np.float32)
+    one = replace(short, actions=np.stack([steps, -steps], axis=1) * 1e-3)
+    ahead, executed = policy.config.predicted_steps, policy.config.executed_steps
+    assert ahead > executed  # so that some steps of a chunk were decided again
+    histories, chunks = decisions_done(policy, [one, one])
+    assert len(histories) == 6 and chunks.shape == (6, ahead, 2)
+    for decision in range(3):
+        for step in range(ahead):
+            at = min(decision * executed + step, len(one.actions) - 1)
+            wanted = policy.normaliser.action(torch.tensor([at * 1e-3, -at * 1e-3]))
+            torch.testing.assert_close(chunks[decision, step], wanted)
+    assert torch.equal(chunks[3:], chunks[:3])
 
 
 def test_self_training_leaves_out_what_strays_but_keeps_the_nearer_half() -> None:

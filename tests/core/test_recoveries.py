@@ -81,6 +81,36 @@ def test_a_recovery_goes_on_from_where_the_policy_had_driven() -> None:
         np.testing.assert_array_equal(one.paths[0], drive.paths[step])
 
 
+def test_takeovers_asked_for_by_number_come_evenly_from_failures_and_groups() -> None:
+    """A good policy fails seldom and goes left seldom; both get as many as what it mostly does."""
+    checkpoint = load_checkpoint(shipped_checkpoint(TaskName.AVOID))
+    driven = rollout(checkpoint, RolloutConfig(episodes=40, seed=1))
+    kinds = {one.info["seed"]: one.outcome["group"] if one.success else None for one in driven}
+    rarest = min(Counter(kinds.values()).values())
+    assert len(set(kinds.values())) == 3 and rarest < 5
+    chosen = recoveries._spread(driven, 15)
+    assert Counter(kinds[one.info["seed"]] for one, _ in chosen) == dict.fromkeys(
+        ("left", "right", None), 5
+    )
+    # As often as needed the few are chosen again, all of them before any a third time.
+    of_rarest = [(one.info["seed"], again) for one, again in recoveries._spread(driven, 3 * 40)]
+    assert len(set(of_rarest)) == 120
+    again_of = Counter(kinds[seed] for seed, again in of_rarest if again == 0)
+    assert again_of == {k: min(40, n) for k, n in Counter(kinds.values()).items()}
+
+
+def test_a_rollout_is_taken_over_at_another_step_when_it_is_chosen_again() -> None:
+    driven = rollout(beginner(), RolloutConfig(episodes=2, seed=5))
+    assert not any(one.success for one in driven)
+    made = make_recoveries(get_task("pushing"), driven, count=8)
+    steps = {(one.info["seed"], one.info["taken_over_at"]) for one in made}
+    assert len(steps) == len(made) > len(driven)
+    once = make_recoveries(get_task("pushing"), driven)
+    assert [one.to_bytes() for one in once] == [
+        one.to_bytes() for one in make_recoveries(get_task("pushing"), driven, count=2)
+    ]
+
+
 def test_the_expert_goes_on_in_the_mode_that_the_policy_was_after() -> None:
     """A policy that is good at Avoid is taken over after it has chosen a side."""
     made = taken_over(load_checkpoint(shipped_checkpoint(TaskName.AVOID)), episodes=30, seed=1)

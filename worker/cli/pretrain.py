@@ -22,7 +22,7 @@ RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
 ROUND_SEEDS = 1_000_000  # … how far the seeds of its rounds are apart
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
 # Fields of a preset that an argument changes.
-OF_PRESETS = ("updates", "executed_steps", "rounds", "recoveries", "round_updates")
+OF_PRESETS = ("updates", "executed_steps", "rounds", "recoveries", "drives", "round_updates")
 PRECISIONS = ("float32", "bfloat16")  # of rodif_core.training_state
 
 
@@ -52,6 +52,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--recoveries", type=int, help="takeovers tried a round (default: the preset's)"
+    )
+    parser.add_argument(
+        "--drives",
+        type=int,
+        help="rollouts for each takeover; from 2 on, as many takeovers from the failures as from"
+        " the successes of each group (default: the preset's)",
     )
     parser.add_argument("--round-updates", type=int, help="of a round (default: the preset's)")
     parser.add_argument("--seed", type=int, default=0)
@@ -127,10 +133,12 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     for number in range(config.rounds + 1):
         if checkpoint is not None:
             first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
-            driven = rollout(checkpoint, RolloutConfig(episodes=config.recoveries, seed=first_seed))
+            drives = config.recoveries * config.drives
+            driven = rollout(checkpoint, RolloutConfig(episodes=drives, seed=first_seed))
             on_the_way.append(sum(one.success for one in driven) / len(driven))
             bar.console.print(f"before round {number}: success {on_the_way[-1]:.1%}")
-            shown += make_recoveries(task, driven, args.preferred_share)
+            count = config.recoveries if config.drives > 1 else None
+            shown += make_recoveries(task, driven, args.preferred_share, count)
         updates = config.round_updates if number else config.updates
         training = bar.add_task(f"training {number}", total=updates)
 
