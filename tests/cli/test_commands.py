@@ -127,11 +127,12 @@ def test_pretrain_writes_a_checkpoint_with_its_measurements(
 def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path: Path):
     file = tmp_path / "new.safetensors"
     sizes = ["--demonstrations", "4", "--updates", "2", "--track", "0", "--evaluate", "0"]
-    rounds = ["--rounds", "1", "--recoveries", "4", "--round-updates", "3", "--executed-steps", "4"]
-    work = ["--workspace", str(tmp_path / "work")]
+    rounds = ["--rounds", "1", "--recoveries", "4", "--drives", "2", "--round-updates", "3"]
+    work = ["--workspace", str(tmp_path / "work"), "--executed-steps", "4"]
     assert main(["pretrain", "pushing", "--out", str(file), *sizes, *rounds, *work]) == 0
     made = load_checkpoint(file.read_bytes())
     assert made.task is TaskName.PUSHING
+    assert made.card["preset"]["drives"] == 2 and 1 <= made.card["recoveries"] <= 4
     assert made.policy.config.executed_steps == 4
     assert made.card["start"] is not None
     assert made.card["demonstrations"] == 4 + made.card["recoveries"]
