@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
-from rodif_core.intervals import wilson_interval
 from rodif_core.spec import TaskName
 from rodif_core.tasks import get_task
 from worker.cli.loop import DemoConfig, DemoResult
@@ -23,10 +22,7 @@ def evaluation(alignment: float, success: float) -> dict[str, Any]:
         "alignment_of_successes": alignment / success,
         "off_support": 0.02,
         "n": 200,
-        "intervals": {
-            "success": wilson_interval(round(success * 200), 200),
-            "alignment": wilson_interval(round(alignment * 200), 200),
-        },
+        "intervals": {"success": [0.0, 1.0], "alignment": [0.0, 1.0]},
         "paths": [[[0.5, 0.0]]],
     }
 
@@ -50,7 +46,7 @@ def test_rise_of_thirty_points_with_success_kept_is_a_success():
     ("after", "state", "message"),
     [
         (evaluation(0.44, 0.9), "published", "a rise of at least 0.30"),
-        (evaluation(0.6, 0.66), "published", "success fell from 0.750 to 0.660"),
+        (evaluation(0.7, 0.74), "published", "success fell from 0.750 to 0.740"),
         (evaluation(0.9, 0.9), "rejected", "not published: the round is rejected"),
     ],
 )
@@ -59,24 +55,13 @@ def test_anything_less_is_a_failure_that_says_why(after: dict[str, Any], state: 
     assert message in sentence
 
 
-def test_success_may_measure_lower_by_what_chance_explains_and_no_more():
-    # By hand, of 200 rollouts 150 [0.686, 0.805] before; 133 [0.597, 0.727] are 8.5 points less, of
-    # which chance explains hypot(0.062, 0.064) = 8.9; 132 [0.592, 0.722] are 9.0 points less.
-    assert result(evaluation(0.6, 0.665)).failures() == []
-    assert len(result(evaluation(0.6, 0.66)).failures()) == 1
-
-
-def test_where_few_successes_could_be_turned_half_of_them_are_enough():
-    # 0.20 of the rollouts succeed in other groups, of which 0.10 must be won …
-    for alignment, failures in ((0.66, 0), (0.64, 1)):
-        one = result(evaluation(alignment, 0.75))
-        one.evaluations["before"] = evaluation(0.55, 0.75)
+def test_where_most_is_as_preferred_two_fifths_of_the_rest_are_enough():
+    # 0.70 before leaves 0.30, of which 0.12 must be won.
+    before = evaluation(0.70, 0.75)
+    for alignment, failures in ((0.83, 0), (0.81, 1)):
+        one = result(evaluation(alignment, 0.9))
+        one.evaluations["before"] = before
         assert len(one.failures()) == failures
-    # … but a rise that chance explains is none.
-    one = result(evaluation(0.75, 0.75))
-    one.evaluations["before"] = evaluation(0.70, 0.75)
-    (sentence,) = one.failures()
-    assert "n = 200 rollouts do not show that it rose" in sentence
 
 
 def test_json_has_the_four_policies_the_labels_and_the_seconds():

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import ValueOutOfRangeError
-from rodif_core.intervals import surely_below
 from rodif_core.spec import EVALUATION_SEED, FinetuneMethod, RolloutConfig
 from server.states import PublishRule
 
@@ -24,9 +23,9 @@ if TYPE_CHECKING:
     from worker.cli.client import Client
     from worker.cli.simulate import SimulationReport
 
-# A demo that steers less has failed. Steering turns successes of other groups into preferred ones;
-# where these are less than 0.60 of the rollouts, half of them are enough.
-ALIGNMENT_GAIN, TURNED_SHARE = 0.30, 0.5
+# A demo that steers less has failed; where the policy mostly does what is preferred already, two
+# fifths of what was missing are enough.
+ALIGNMENT_GAIN, GAP_SHARE = 0.30, 0.4
 MEASURES = ("success", "alignment", "alignment_of_successes", "off_support", "n", "intervals")
 COMPARED = (FinetuneMethod.RODIF, FinetuneMethod.DP_DPO)
 # For one stage. Work that fails says so at once; this only ends a demo that hangs, and must not end
@@ -104,20 +103,16 @@ class DemoResult:
         }
 
     def failures(self) -> list[str]:
-        """Why the demo did not show what it is for; empty when it did.
-
-        Rises and falls count when chance does not explain them: of two policies that are equally
-        good, one measures lower than the other every second time.
-        """
+        """Why the demo did not show what it is for; empty when it did."""
         before, after = self.evaluations["before"], self.evaluations["after"]
         found = []
-        wanted = min(ALIGNMENT_GAIN, TURNED_SHARE * (before["success"] - before["alignment"]))
-        told = f"alignment went from {before['alignment']:.3f} to {after['alignment']:.3f}"
+        wanted = min(ALIGNMENT_GAIN, GAP_SHARE * (1 - before["alignment"]))
         if after["alignment"] - before["alignment"] < wanted:
-            found.append(f"{told}; a rise of at least {wanted:.2f} was expected")
-        elif not _surely_less("alignment", before, after):
-            found.append(f"{told}; n = {after['n']} rollouts do not show that it rose")
-        if _surely_less("success", after, before):
+            found.append(
+                f"alignment went from {before['alignment']:.3f} to {after['alignment']:.3f};"
+                f" a rise of at least {wanted:.2f} was expected"
+            )
+        if after["success"] < before["success"]:
             found.append(f"success fell from {before['success']:.3f} to {after['success']:.3f}")
         if self.state != "published":
             found.append(f"the steered policy was not published: the round is {self.state}")
@@ -131,13 +126,6 @@ class DemoResult:
             yield lambda text: status.update(f"{told} … {text}")
         self.seconds[name] = time.monotonic() - started
         console.print(f"{told}: {self.seconds[name]:.1f} s", highlight=False)
-
-
-def _surely_less(measure: str, less: Mapping[str, Any], more: Mapping[str, Any]) -> bool:
-    """Whether a rate of evaluation `less` is below that of `more` by more than chance explains."""
-    return surely_below(
-        more[measure], more["intervals"][measure], less[measure], less["intervals"][measure]
-    )
 
 
 def play(
