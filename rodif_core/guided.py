@@ -116,9 +116,9 @@ def _guide(this: _Run, kept: Sequence[Trajectory], scale: float) -> Trial:
     done = _load_trial(this, name)
     if done is not None:
         return done
-    policy = this.checkpoint.policy
+    reference = this.checkpoint.policy
     policy = guide(
-        policy, *decisions_done(policy, kept), scale, this.config.guide, this.config.seed,
+        reference, *decisions_done(reference, kept), scale, this.config.guide, this.config.seed,
         this.stage(name),
     )  # fmt: skip
     return _try(this, name, policy, scale)
