@@ -167,7 +167,7 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     ("sorting", "cpu"): {
         "executed_steps": 4,
         "updates": 30_000,
-        "rounds": 2,
+        "rounds": 3,
         "recoveries": 900,
         "drives": 4,
     },

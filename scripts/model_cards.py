@@ -25,7 +25,7 @@ PAPER_SUCCESS = {"avoid": 78, "pushing": 58, "sorting": 82, "aligning": 5, "stac
 CPU_MINUTES = {
     "avoid": 10,
     "pushing": 33,
-    "sorting": 115,
+    "sorting": 140,
     "aligning": 57,
     "aligning-state": 9,
     "stacking": 150,
