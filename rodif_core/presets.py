@@ -44,7 +44,6 @@ class PretrainConfig:
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
     encoder: EncoderConfig = EncoderConfig()  # how their encoder is trained
-    encoder_demonstrations: int = 0  # for the encoder alone; 0: it shares the policy's
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -56,13 +55,9 @@ class PretrainConfig:
             raise ValueOutOfRangeError("ema_decay", self.ema_decay, "in [0, 1)")
         least = {"updates": 1, "round_updates": 1, "recoveries": 1, "drives": 1}
         least |= {"rounds": 0, "batch_size": 1}
-        least |= {"encoder_demonstrations": 0}
         for name, value in (least | {"warm_up": 0, "weight_decay": 0}).items():
             if getattr(self, name) < value:
                 raise ValueOutOfRangeError(name, getattr(self, name), f"at least {value}")
-        if self.encoder_demonstrations and self.images is None:
-            legal = "0 for a policy without pictures"
-            raise ValueOutOfRangeError("encoder_demonstrations", self.encoder_demonstrations, legal)
 
     def policy_config(self, task: Task) -> PolicyConfig:
         """The policy's shape for a task.

@@ -86,7 +86,6 @@ def pretrain(
     config: PretrainConfig,
     *,
     start: Checkpoint | None = None,
-    encoder_demonstrations: Sequence[Trajectory] = (),
     workspace: Path | None = None,
     kept_rows: Path | None = None,
     device: str = "cpu",
@@ -98,7 +97,6 @@ def pretrain(
 
     start      go on from this policy, with its size and normaliser, for `config.round_updates`,
                instead of from fresh weights for `config.updates`
-    encoder_demonstrations  what a fresh encoder is trained on, if not on the demonstrations
     kept_rows  folder for encoded pictures, which trainings with the same encoder may share
     precision  of the forward passes; by default mixed on a GPU
     track      rollouts of the policy after each of the first four fifths of the training; their
@@ -111,13 +109,15 @@ def pretrain(
     check_device(device)
     precision = precision or usual_precision(device)
     basis = {"device": device, "precision": precision.value, "start": start and start.digest}
-    _claim(workspace, task_name, demonstrations, encoder_demonstrations, config, basis)
+    if workspace is not None:
+        shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
+        claim_workspace(workspace, basis | shown | _deciding(config))
     task = get_task(task_name)
     known, held_out = _split(demonstrations, config)
     encoder, encoder_curve = start.policy.encoder if start else None, None
     if config.images is not None and encoder is None:
         encoder, encoder_curve = train_encoder(
-            task, encoder_demonstrations or known, held_out, config.images, config.encoder,
+            task, known, held_out, config.images, config.encoder,
             seed=config.seed, workspace=workspace, device=device, precision=precision,
             progress=progress,
         )  # fmt: skip
@@ -137,26 +137,9 @@ def pretrain(
         progress,
     )
     curves |= _earlier_curves(start) if start else {"encoder_curve": encoder_curve}
-    card = {"kind": "pretrained", "demonstrations": len(demonstrations), **basis, **curves}
-    card |= {"architecture": shape.architecture.value, "preset": asdict(config)}
+    facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
+    card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
     return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
-
-
-def _claim(
-    workspace: Path | None,
-    task_name: TaskName,
-    demonstrations: Sequence[Trajectory],
-    encoder_demonstrations: Sequence[Trajectory],
-    config: PretrainConfig,
-    basis: dict[str, Any],
-) -> None:
-    """Raises LearningError when the workspace belongs to another training."""
-    if workspace is None:
-        return
-    shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
-    if encoder_demonstrations:
-        shown["encoder_demonstrations"] = _fingerprint(encoder_demonstrations)
-    claim_workspace(workspace, basis | shown | _deciding(config))
 
 
 def _split(
@@ -178,9 +161,9 @@ def _split(
 
 
 def _deciding(config: PretrainConfig) -> dict[str, Any]:
-    """What decides the result of one training beside what it is shown; how many follow it does
-    not, so that a finished series can have another round."""
-    following = ("rounds", "recoveries", "drives", "encoder_demonstrations")
+    """What decides the result of one training; how many follow it does not, so that a finished
+    series can have another round."""
+    following = ("rounds", "recoveries", "drives")
     return {k: v for k, v in asdict(config).items() if k not in following}
 
 

@@ -86,11 +86,10 @@ def _card(checkpoint: Checkpoint) -> str:
     seen = ""
     if checkpoint.policy.encoder is not None:
         weights_seen = sum(value.numel() for value in checkpoint.policy.encoder.parameters())
-        encoder, own = preset["encoder"], preset.get("encoder_demonstrations")
-        of = f" of {own:,} demonstrations of its own" if own else ""
+        encoder = preset["encoder"]
         seen = (
             f" The encoder of its {config.images.cameras if config.images else 0} cameras has"
-            f" {weights_seen:,} weights and saw {encoder['moments']:,} moments{of} in"
+            f" {weights_seen:,} weights and saw {encoder['moments']:,} moments in"
             f" {encoder['updates']:,} updates of {encoder['batch_size']}."
         )
     shape = (

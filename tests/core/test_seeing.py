@@ -127,26 +127,6 @@ def test_experts_take_over_from_a_policy_that_sees(checkpoint: Checkpoint) -> No
     assert further.policy.encoder is checkpoint.policy.encoder
 
 
-def test_encoder_is_trained_on_demonstrations_of_its_own_when_given(
-    demonstrations: list[Trajectory],
-) -> None:
-    own = make_demonstrations(TASK, episodes=3, seed=7)
-    config = replace(CONFIG, updates=2, encoder=replace(ENCODER, updates=3))
-    made = pretrain(TASK.name, demonstrations, config, encoder_demonstrations=own)
-    shared = pretrain(TASK.name, demonstrations, config)
-    wanted = train_encoder(TASK, own, demonstrations[:1], IMAGES, config.encoder, seed=0)[0]
-    weights = [list(one.parameters()) for one in (made.policy.encoder, wanted)]  # type: ignore[union-attr]
-    assert all(torch.equal(a, b) for a, b in zip(*weights, strict=True))
-    assert made.digest != shared.digest
-    assert made.card["demonstrations"] == 4  # the policy's
-    assert torch.equal(made.support.points, shared.support.points)
-
-
-def test_demonstrations_for_an_encoder_are_refused_where_there_is_none() -> None:
-    with pytest.raises(ValueOutOfRangeError, match="encoder_demonstrations is 3.*0 for a policy"):
-        PretrainConfig(encoder_demonstrations=3)
-
-
 def test_pictures_are_encoded_once_for_all_trainings_with_one_encoder(
     checkpoint: Checkpoint, demonstrations: list[Trajectory], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

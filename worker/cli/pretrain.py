@@ -15,20 +15,14 @@ if TYPE_CHECKING:
 
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.presets import PretrainConfig
-    from rodif_core.tasks.base import Task
     from rodif_core.training_state import UpdateProgress
-    from rodif_core.trajectory import Trajectory
 
 # Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
 RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
 ROUND_SEEDS = 1_000_000  # … how far the seeds of its rounds are apart
-ENCODER_SEEDS = 300_000_000  # of the demonstrations that only an encoder is shown
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
 # Fields of a preset that an argument changes.
-OF_PRESETS = (
-    "updates", "executed_steps", "encoder_demonstrations",
-    "rounds", "recoveries", "drives", "round_updates",
-)  # fmt: skip
+OF_PRESETS = ("updates", "executed_steps", "rounds", "recoveries", "drives", "round_updates")
 PRECISIONS = ("float32", "bfloat16")  # of rodif_core.training_state
 
 
@@ -64,12 +58,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=int,
         help="rollouts for each takeover; from 2 on, as many takeovers from the failures as from"
         " the successes of each group (default: the preset's)",
-    )
-    parser.add_argument(
-        "--encoder-demonstrations",
-        type=int,
-        help="for the encoder of a task with cameras alone, so that the policy learns from starts"
-        " that are new to it; 0: both learn from the same (default: the preset's)",
     )
     parser.add_argument("--round-updates", type=int, help="of a round (default: the preset's)")
     parser.add_argument("--seed", type=int, default=0)
@@ -123,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> Checkpoint:
     """The first training and the rounds after it, each on all that experts have shown so far."""
+    from rodif_core.demonstrations import make_demonstrations
     from rodif_core.pretrain import pretrain
     from rodif_core.recoveries import make_recoveries
     from rodif_core.rollout import rollout
@@ -131,11 +120,14 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
 
     check_device(args.device)
     task = get_task(args.task)
-    shown = _demonstrate(args, task, args.demonstrations, args.seed, bar)
-    only_seen: list[Trajectory] = []  # what the encoder alone is shown
-    if config.encoder_demonstrations:
-        seed = ENCODER_SEEDS + args.seed
-        only_seen = _demonstrate(args, task, config.encoder_demonstrations, seed, bar)
+    making = bar.add_task("demonstrations", total=args.demonstrations)
+    shown = make_demonstrations(
+        task,
+        episodes=args.demonstrations,
+        seed=args.seed,
+        preferred_share=args.preferred_share,
+        progress=lambda done, _: bar.update(making, completed=done),
+    )
     checkpoint = None
     on_the_way: list[float] = []  # success of the policies that experts took over from
     for number in range(config.rounds + 1):
@@ -159,7 +151,6 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             shown,
             config,
             start=checkpoint,
-            encoder_demonstrations=only_seen,
             workspace=workspace,
             kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
@@ -175,21 +166,6 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         "success_before_rounds": on_the_way,
     }
     return replace(checkpoint, card=checkpoint.card | facts)
-
-
-def _demonstrate(
-    args: argparse.Namespace, task: Task, count: int, seed: int, bar: Progress
-) -> list[Trajectory]:
-    from rodif_core.demonstrations import make_demonstrations
-
-    making = bar.add_task("demonstrations", total=count)
-    return make_demonstrations(
-        task,
-        episodes=count,
-        seed=seed,
-        preferred_share=args.preferred_share,
-        progress=lambda done, _: bar.update(making, completed=done),
-    )
 
 
 def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
