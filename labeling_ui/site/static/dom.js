@@ -106,13 +106,18 @@ export function ask({ title, text = "", fields = [], confirm = "OK", danger = fa
   });
 }
 
-// Something to read, until it is closed.
+// Something to read, until it is closed. The button takes it off the page at once, as it may be a
+// secret: the browser tells of "close" only some time after the dialog has vanished.
 export function show(title, ...content) {
+  const form = element("form.dialog-actions", {}, element("button.button.primary", {}, "Close"));
   const dialog = element(
-    "dialog.dialog.broad", { "aria-label": title },
-    element("h2", {}, title), ...content,
-    element("form.dialog-actions", { method: "dialog" }, element("button.button.primary", {}, "Close")),
+    "dialog.dialog.broad", { "aria-label": title }, element("h2", {}, title), ...content, form,
   );
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    dialog.close(); // gives the focus back
+    dialog.remove();
+  });
   dialog.addEventListener("close", () => dialog.remove());
   document.body.append(dialog);
   dialog.showModal();
