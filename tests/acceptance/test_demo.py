@@ -15,7 +15,6 @@ import pytest
 
 from rodif_core import shipped
 from worker.cli.client import Client
-from worker.cli.loop import DemoResult
 from worker.cli.main import main
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
@@ -66,11 +65,12 @@ def test_headless_demo_writes_the_table_and_leaves_nothing_running(tmp_path: Pat
     # So few labels may steer too little for the demo's own bar; that it steers is certain.
     before, after = result["before"], result["after"]
     assert after["alignment"] > before["alignment"], told
-    # tests/cli/test_demo_result.py works the bar out by hand; here it decides the exit code.
-    evaluations = {"before": before, "after": after}
-    missed = DemoResult(evaluations, state=result["round"]["state"]).failures()
-    assert done.returncode == (1 if missed else 0), told
-    assert all(sentence in told for sentence in missed), told
+    shown = (
+        after["alignment"] - before["alignment"] >= 0.30
+        and after["success"] >= before["success"]
+        and result["round"]["state"] == "published"
+    )
+    assert done.returncode == (0 if shown else 1), told
     left = [p for p in psutil.process_iter(["cmdline"]) if str(state) in str(p.info["cmdline"])]
     assert left == []
 
