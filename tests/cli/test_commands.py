@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -42,6 +43,18 @@ def test_unknown_command_names_the_legal_ones(capsys: pytest.CaptureFixture[str]
         main(["fly"])
     assert caught.value.code == 2
     assert "invalid choice: 'fly'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wish", [["tasks", "--json"], ["tasks"]])  # at once, and at the end
+def test_reader_who_has_left_ends_the_command_without_a_traceback(wish: list[str]):
+    unread, output = os.pipe()
+    os.close(unread)
+    code = "import sys; from worker.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    with open(output, "wb") as nobody:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *wish], stdout=nobody, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_evaluate_prints_rates_and_intervals_of_a_file(

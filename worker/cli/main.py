@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import select
 import sys
 from collections.abc import Sequence
 
@@ -53,16 +55,33 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; 0 when it did what was asked, 1 on an error, 130 on Ctrl-C."""
+    """Run one command; 0 when it did what was asked, 1 on an error or when nobody reads the output
+    any more, 130 on Ctrl-C."""
     args = build_parser().parse_args(arguments)
     try:
         status: int = COMMANDS[args.command].run(args)
+        sys.stdout.flush()  # a reader who has left shows here, not while the interpreter ends
         return status
     except RodifError as error:
         print(f"rodif {args.command}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:
+        if not _reader_left():
+            raise
+        return 1
+
+
+def _reader_left() -> bool:
+    """Whether it is the standard output that nobody reads, as after `| head`; it is then given up,
+    or Python would complain of it once more at the end."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)  # errors and hang-ups are told unasked
+    left = any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+    if left:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return left
 
 
 if __name__ == "__main__":
