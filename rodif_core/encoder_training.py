@@ -3,7 +3,9 @@
 From pixels to actions in one go, a policy needs many passes over many pictures. The simulation
 knows what a picture shows, so the encoder learns that first, from moments drawn evenly out of all
 demonstrations; then it is frozen, every frame is encoded once, and the denoiser trains on rows of
-numbers, as in a task without pictures. (The paper trains both together.)
+numbers, as in a task without pictures. (The paper trains both together.) A policy comes to see what
+no demonstration shows, so the encoder can go on learning from the policy's own rollouts: what their
+pictures show is known as well.
 
 Legend: R moments, S observation dims of the task, P of them proprioception, C cameras, H x W
 pixels, O = P + features.
@@ -49,6 +51,7 @@ class EncoderConfig:
 
     moments: int = 20_000  # pictures of how many states, at most; 55 KB each
     updates: int = 4_000
+    round_updates: int = 0  # of a training that goes on from another policy; 0: its encoder stays
     batch_size: int = 64
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
@@ -58,6 +61,8 @@ class EncoderConfig:
         for name in ("moments", "updates", "batch_size"):
             if getattr(self, name) < 1:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
+        if self.round_updates < 0:
+            raise ValueOutOfRangeError("round_updates", self.round_updates, "at least 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +128,8 @@ def train_encoder(
     config: EncoderConfig,
     *,
     seed: int,
+    start: ImageEncoder | None = None,
+    driven: Sequence[Trajectory] = (),
     workspace: Path | None = None,
     device: str = "cpu",
     precision: Precision = Precision.FLOAT32,
@@ -130,38 +137,69 @@ def train_encoder(
 ) -> tuple[ImageEncoder, list[dict[str, float]]]:
     """A trained encoder and its curve; goes on from `workspace` when a partial state is there.
 
+    start   go on from this encoder for `config.round_updates`, after a warm-up in which only the
+            new head learns, as that would else spoil what the encoder knows
+    driven  rollouts of a policy, where half of the moments are then drawn
+
     Raises LearningError when the loss is not finite and GraphicsError where nothing can be drawn.
     """
     states = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
-    seen = Moments.draw(task, known, images, states, config.moments)
+    seen = _moments(task, known, driven, images, states, config.moments)
     unseen = Moments.draw(task, held_out, images, states, HELD_OUT_MOMENTS)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = _Telling(images, seen.felt.shape[1], seen.hidden.shape[1]).to(device)
+    updates, waiting = config.updates, 0
+    if start is not None:
+        model.encoder.load_state_dict(start.state_dict())
+        updates, waiting = config.round_updates, min(config.warm_up, config.round_updates // 2)
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
     state_file = workspace / "encoder.safetensors" if workspace is not None else None
     modules: dict[str, nn.Module] = {"model": model}
     facts = load_state(state_file, modules, optimizer) if state_file is not None else None
-    start, curve = (facts["update"], facts["curve"]) if facts else (0, [])
-    for update in range(start, config.updates):
+    first, curve = (facts["update"], facts["curve"]) if facts else (0, [])
+    for update in range(first, updates):
         generator = torch.Generator().manual_seed(seed * 1_000_003 + update)
+        model.encoder.requires_grad_(update >= waiting)
+        share = cosine_rate(update - waiting, config.warm_up, updates - waiting)
         for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * cosine_rate(update, config.warm_up, config.updates)
+            group["lr"] = config.learning_rate * (share if update >= waiting else 1.0)
         pick = torch.randint(len(seen.felt), (config.batch_size,), generator=generator)
         with forward_precision(device, precision):
             loss = model.error(*seen.pick(pick, device))
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-        if update % REPORT_EVERY == 0 or update == config.updates - 1:
+        if update % REPORT_EVERY == 0 or update == updates - 1:
             curve.append(_report(model, float(loss.detach()), unseen, update, device))
             if progress is not None:
-                progress(update + 1, config.updates, curve[-1])
+                progress(update + 1, updates, curve[-1])
         if state_file is not None and (update + 1) % SAVE_EVERY == 0:
             save_state(state_file, modules, optimizer, {"update": update + 1, "curve": curve})
     return model.encoder.cpu().eval().requires_grad_(False), curve
+
+
+def _moments(
+    task: Task,
+    known: Sequence[Trajectory],
+    driven: Sequence[Trajectory],
+    images: ImageConfig,
+    states: Normaliser,
+    count: int,
+) -> Moments:
+    """Of what experts have shown alone, or half of that and half of what a policy met."""
+    if not driven:
+        return Moments.draw(task, known, images, states, count)
+    half = count // 2
+    shown = Moments.draw(task, known, images, states, count - half)
+    met = Moments.draw(task, driven, images, states, half)
+    return Moments(
+        torch.cat([shown.frames, met.frames]),
+        torch.cat([shown.felt, met.felt]),
+        torch.cat([shown.hidden, met.hidden]),
+    )
 
 
 @torch.no_grad()

@@ -176,7 +176,7 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     },
     ("stacking", "cpu"): {
         "images": ImageConfig(),
-        "encoder": EncoderConfig(moments=24_000, updates=5_000),
+        "encoder": EncoderConfig(moments=24_000, updates=5_000, round_updates=2_000),
         "rounds": 4,
     },
     **{

@@ -86,6 +86,7 @@ def pretrain(
     config: PretrainConfig,
     *,
     start: Checkpoint | None = None,
+    driven: Sequence[Trajectory] = (),
     workspace: Path | None = None,
     kept_rows: Path | None = None,
     device: str = "cpu",
@@ -96,7 +97,8 @@ def pretrain(
     """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
 
     start      go on from this policy, with its size and normaliser, for `config.round_updates`,
-               instead of from fresh weights for `config.updates`
+               instead of from fresh weights for `config.updates`; its encoder, if it has one,
+               learns on for `config.encoder.round_updates`, also from what it met when `driven`
     kept_rows  folder for encoded pictures, which trainings with the same encoder may share
     precision  of the forward passes; by default mixed on a GPU
     track      rollouts of the policy after each of the first four fifths of the training; their
@@ -115,15 +117,18 @@ def pretrain(
     task = get_task(task_name)
     known, held_out = _split(demonstrations, config)
     encoder, encoder_curve = start.policy.encoder if start else None, None
-    if config.images is not None and encoder is None:
+    if config.images is not None and (encoder is None or config.encoder.round_updates):
         encoder, encoder_curve = train_encoder(
             task, known, held_out, config.images, config.encoder,
-            seed=config.seed, workspace=workspace, device=device, precision=precision,
-            progress=progress,
+            seed=config.seed, start=encoder, driven=driven, workspace=workspace, device=device,
+            precision=precision, progress=progress,
         )  # fmt: skip
     shape = config.policy_config(task) if start is None else start.policy.config
     seen, unseen = (encode(task, shape, encoder, part, kept_rows) for part in (known, held_out))
-    policy = _fresh(shape, seen, encoder, config) if start is None else start.policy.copy()
+    if start is None:
+        policy = _fresh(shape, seen, encoder, config)
+    else:
+        policy = replace(start.policy.copy(), encoder=encoder)
     support = _support(known, held_out, policy)
     average, curves = _train(
         policy,
@@ -136,7 +141,9 @@ def pretrain(
         partial(_success, task_name, support, track) if track else None,
         progress,
     )
-    curves |= _earlier_curves(start) if start else {"encoder_curve": encoder_curve}
+    curves["encoder_curve"] = encoder_curve
+    if start is not None:
+        curves |= _earlier_curves(start, encoder_curve)
     facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
     card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
     return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
@@ -167,12 +174,13 @@ def _deciding(config: PretrainConfig) -> dict[str, Any]:
     return {k: v for k, v in asdict(config).items() if k not in following}
 
 
-def _earlier_curves(start: Checkpoint) -> dict[str, Any]:
-    """What the card of a policy that another one goes on from says about its trainings."""
-    names = ("held_out_curve", "rollout_curve")
+def _earlier_curves(start: Checkpoint, encoder_curve: Any | None) -> dict[str, Any]:
+    """What the card of a policy that another one goes on from says about its trainings; of the
+    encoder there too, once it has learned on."""
+    names = ["held_out_curve", "rollout_curve"] + (["encoder_curve"] if encoder_curve else [])
     before = {name: start.card[name] for name in names if name in start.card}
     return {
-        "encoder_curve": start.card.get("encoder_curve"),
+        "encoder_curve": encoder_curve or start.card.get("encoder_curve"),
         "earlier_curves": [*start.card.get("earlier_curves", []), before],
     }
 

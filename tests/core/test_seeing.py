@@ -19,7 +19,7 @@ from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.evaluate import summarise
 from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from rodif_core.policies.mlp import MlpSize
-from rodif_core.policies.resnet import ImageConfig
+from rodif_core.policies.resnet import ImageConfig, ImageEncoder
 from rodif_core.presets import PRESETS, PretrainConfig, preset_for
 from rodif_core.pretrain import pretrain
 from rodif_core.recoveries import make_recoveries
@@ -159,14 +159,61 @@ def test_pictures_are_encoded_once_for_all_trainings_with_one_encoder(
     assert drawn[1:] == [len(one.qpos) for one in two]
 
 
+def test_encoder_learns_on_from_what_the_policy_met(
+    checkpoint: Checkpoint, demonstrations: list[Trajectory]
+) -> None:
+    met = rollout(checkpoint, RolloutConfig(episodes=1, seed=9))
+    learning = replace(CONFIG, round_updates=2, encoder=replace(ENCODER, round_updates=6))
+    after = pretrain(TASK.name, demonstrations, learning, start=checkpoint, driven=met)
+    before = checkpoint.card["encoder_curve"]
+    assert after.card["earlier_curves"][0]["encoder_curve"] == before
+    assert after.card["encoder_curve"][-1]["update"] == 5
+    same_pictures = pretrain(TASK.name, demonstrations, learning, start=checkpoint)
+    frozen = pretrain(TASK.name, demonstrations, replace(CONFIG, round_updates=2), start=checkpoint)
+    encoders = [
+        torch.cat([p.flatten() for p in one.policy.encoder.parameters()])
+        for one in (checkpoint, frozen, same_pictures, after)
+        if one.policy.encoder is not None
+    ]
+    assert torch.equal(encoders[0], encoders[1])
+    assert not torch.equal(encoders[0], encoders[2])
+    assert not torch.equal(encoders[2], encoders[3])
+    assert frozen.card["encoder_curve"] == before
+
+
+def test_known_encoder_waits_until_its_new_head_makes_sense(
+    checkpoint: Checkpoint, demonstrations: list[Trajectory]
+) -> None:
+    known = checkpoint.policy.encoder
+    assert known is not None
+    config = replace(ENCODER, round_updates=6, warm_up=3)
+    parts = (TASK, demonstrations[:3], demonstrations[3:], IMAGES)
+    learnt, curve = train_encoder(*parts, config, seed=0, start=known)
+    assert [point["update"] for point in curve] == [0, 5]
+    fresh, _ = train_encoder(*parts, replace(ENCODER, updates=6), seed=0)
+
+    def moved(one: ImageEncoder) -> float:
+        pairs = zip(one.parameters(), known.parameters(), strict=True)
+        return max(float((a - b).abs().max()) for a, b in pairs)
+
+    # At most three steps of Adam, each of about the learning rate a weight.
+    assert 0 < moved(learnt) < 4 * config.learning_rate < moved(fresh)
+
+
+@pytest.mark.parametrize("known", [False, True])
 def test_killed_encoder_training_goes_on_to_the_same_weights(
-    demonstrations: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    known: bool,
+    checkpoint: Checkpoint,
+    demonstrations: list[Trajectory],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(encoder_training, "SAVE_EVERY", 4)
     monkeypatch.setattr(encoder_training, "REPORT_EVERY", 2)
-    config = replace(ENCODER, updates=8)
+    config = replace(ENCODER, updates=8, round_updates=8, warm_up=2)
     parts = (TASK, demonstrations[:3], demonstrations[3:], IMAGES, config)
-    whole, curve = train_encoder(*parts, seed=0)
+    start = checkpoint.policy.encoder if known else None
+    whole, curve = train_encoder(*parts, seed=0, start=start)
 
     class KilledError(Exception):
         pass
@@ -176,8 +223,8 @@ def test_killed_encoder_training_goes_on_to_the_same_weights(
             raise KilledError
 
     with pytest.raises(KilledError):
-        train_encoder(*parts, seed=0, workspace=tmp_path, progress=kill)
-    resumed, again = train_encoder(*parts, seed=0, workspace=tmp_path)
+        train_encoder(*parts, seed=0, start=start, workspace=tmp_path, progress=kill)
+    resumed, again = train_encoder(*parts, seed=0, start=start, workspace=tmp_path)
     assert again == curve
     for one, other in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(one, other)

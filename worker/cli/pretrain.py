@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.presets import PretrainConfig
     from rodif_core.training_state import UpdateProgress
+    from rodif_core.trajectory import Trajectory
 
 # Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
 RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
@@ -129,6 +130,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         progress=lambda done, _: bar.update(making, completed=done),
     )
     checkpoint = None
+    driven: list[Trajectory] = []
     on_the_way: list[float] = []  # success of the policies that experts took over from
     for number in range(config.rounds + 1):
         if checkpoint is not None:
@@ -151,6 +153,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             shown,
             config,
             start=checkpoint,
+            driven=driven,
             workspace=workspace,
             kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
