@@ -7,8 +7,7 @@ numbers, as in a task without pictures. (The paper trains both together.) A poli
 no demonstration shows, so the encoder can go on learning from the policy's own rollouts: what their
 pictures show is known as well.
 
-Legend: R moments, S observation dims of the task, P of them proprioception, C cameras, H x W
-pixels, O = P + features.
+Legend: O dims of the rows that a policy reads, proprioception and features.
 """
 
 from __future__ import annotations
@@ -24,11 +23,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rodif_core.errors import LearningError, ValueOutOfRangeError
+from rodif_core.moments import Moments
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.resnet import ImageConfig, ImageEncoder
-from rodif_core.sight import draw
 from rodif_core.tasks.base import Task
-from rodif_core.tasks.camera import Camera
 from rodif_core.training_state import (
     Precision,
     UpdateProgress,
@@ -50,6 +48,7 @@ class EncoderConfig:
     """How the encoder is trained. Defaults: the CPU preset."""
 
     moments: int = 20_000  # pictures of how many states, at most; 55 KB each
+    rearranged: int = 0  # pictures more, with untouched objects put elsewhere
     updates: int = 4_000
     round_updates: int = 0  # of a training that goes on from another policy; 0: its encoder stays
     batch_size: int = 64
@@ -61,45 +60,9 @@ class EncoderConfig:
         for name in ("moments", "updates", "batch_size"):
             if getattr(self, name) < 1:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
-        if self.round_updates < 0:
-            raise ValueOutOfRangeError("round_updates", self.round_updates, "at least 0")
-
-
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """frames (R, C, H, W, 3) uint8, felt (R, P) and hidden (R, S - P), both normalised: what the
-    robot knows of itself, and what the pictures are to tell."""
-
-    frames: Tensor
-    felt: Tensor
-    hidden: Tensor
-
-    @classmethod
-    def draw(
-        cls,
-        task: Task,
-        demonstrations: Sequence[Trajectory],
-        images: ImageConfig,
-        states: Normaliser,
-        count: int,
-    ) -> Moments:
-        """`count` states, or all if there are fewer, evenly spaced over the demonstrations."""
-        qpos = np.concatenate([one.qpos for one in demonstrations])
-        rows = np.concatenate([one.observations for one in demonstrations])
-        chosen = np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)
-        with Camera(task, images.pixels, images.pixels) as camera:
-            frames = draw(camera, task, qpos[chosen])
-        normalised = states.observation(torch.from_numpy(rows[chosen]))
-        felt, hidden = normalised.tensor_split([task.proprioception_dim], dim=1)
-        return cls(torch.from_numpy(frames), felt, hidden)
-
-    def pick(self, rows: Tensor, device: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Frames, felt and hidden of those rows, on the device."""
-        return (
-            self.frames[rows].to(device),
-            self.felt[rows].to(device),
-            self.hidden[rows].to(device),
-        )
+        for name in ("rearranged", "round_updates"):
+            if getattr(self, name) < 0:
+                raise ValueOutOfRangeError(name, getattr(self, name), "at least 0")
 
 
 class _Telling(nn.Module):
@@ -144,14 +107,12 @@ def train_encoder(
     Raises LearningError when the loss is not finite and GraphicsError where nothing can be drawn.
     """
     states = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
-    seen = _moments(task, known, driven, images, states, config.moments)
+    chance = np.random.default_rng([seed, 3])  # apart from the split's and the weights'
+    seen = _moments(task, known, driven, images, states, config, chance)
     unseen = Moments.draw(task, held_out, images, states, HELD_OUT_MOMENTS)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = _Telling(images, seen.felt.shape[1], seen.hidden.shape[1]).to(device)
+    model = _model(images, seen, start, seed).to(device)
     updates, waiting = config.updates, 0
     if start is not None:
-        model.encoder.load_state_dict(start.state_dict())
         updates, waiting = config.round_updates, min(config.warm_up, config.round_updates // 2)
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
@@ -161,17 +122,14 @@ def train_encoder(
     facts = load_state(state_file, modules, optimizer) if state_file is not None else None
     first, curve = (facts["update"], facts["curve"]) if facts else (0, [])
     for update in range(first, updates):
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + update)
         model.encoder.requires_grad_(update >= waiting)
-        share = cosine_rate(update - waiting, config.warm_up, updates - waiting)
-        for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * (share if update >= waiting else 1.0)
+        rate = cosine_rate(update - waiting, config.warm_up, updates - waiting)
+        rate = config.learning_rate * (rate if update >= waiting else 1.0)
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + update)
         pick = torch.randint(len(seen.felt), (config.batch_size,), generator=generator)
         with forward_precision(device, precision):
             loss = model.error(*seen.pick(pick, device))
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
+        _step(optimizer, loss, rate)
         if update % REPORT_EVERY == 0 or update == updates - 1:
             curve.append(_report(model, float(loss.detach()), unseen, update, device))
             if progress is not None:
@@ -181,25 +139,40 @@ def train_encoder(
     return model.encoder.cpu().eval().requires_grad_(False), curve
 
 
+def _model(images: ImageConfig, seen: Moments, start: ImageEncoder | None, seed: int) -> _Telling:
+    """With weights that depend on the seed alone, but for those that are known."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = _Telling(images, seen.felt.shape[1], seen.hidden.shape[1])
+    if start is not None:
+        model.encoder.load_state_dict(start.state_dict())
+    return model
+
+
+def _step(optimizer: torch.optim.Optimizer, loss: Tensor, rate: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    optimizer.step()
+
+
 def _moments(
     task: Task,
     known: Sequence[Trajectory],
     driven: Sequence[Trajectory],
     images: ImageConfig,
     states: Normaliser,
-    count: int,
+    config: EncoderConfig,
+    rng: np.random.Generator,
 ) -> Moments:
     """Of what experts have shown alone, or half of that and half of what a policy met."""
+    count, elsewhere = config.moments, config.rearranged
     if not driven:
-        return Moments.draw(task, known, images, states, count)
-    half = count // 2
-    shown = Moments.draw(task, known, images, states, count - half)
-    met = Moments.draw(task, driven, images, states, half)
-    return Moments(
-        torch.cat([shown.frames, met.frames]),
-        torch.cat([shown.felt, met.felt]),
-        torch.cat([shown.hidden, met.hidden]),
-    )
+        return Moments.draw(task, known, images, states, count, elsewhere, rng)
+    met = Moments.draw(task, driven, images, states, count // 2, elsewhere // 2, rng)
+    count, elsewhere = count - count // 2, elsewhere - elsewhere // 2
+    return Moments.draw(task, known, images, states, count, elsewhere, rng).and_those(met)
 
 
 @torch.no_grad()

@@ -147,7 +147,7 @@ PRESETS = {
 # On two cores the transformer of the paper's preset sees too few rows to learn Stacking; single
 # actions train an order of magnitude faster (docs/tasks.md has the figures). Missed grasps are what
 # demonstrations do not show, so that takeovers count for more than more demonstrations.
-_CPU_STACKING = replace(_MLP, size=MlpSize(width=256, blocks=4), updates=16_000, rounds=3)
+_CPU_STACKING = replace(_MLP, size=MlpSize(width=256, blocks=4), updates=16_000, rounds=5)
 _OWN_BASES = {("stacking", "cpu"): _CPU_STACKING, ("stacking-state", "cpu"): _CPU_STACKING}
 
 # Pushing needs wider layers and more updates than Avoid, and both look again sooner: a cube that
@@ -176,7 +176,9 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     },
     ("stacking", "cpu"): {
         "images": ImageConfig(),
-        "encoder": EncoderConfig(moments=24_000, updates=5_000, round_updates=2_000),
+        "encoder": EncoderConfig(
+            moments=20_000, rearranged=40_000, updates=6_000, round_updates=3_000
+        ),
         "rounds": 4,
     },
     **{

@@ -27,7 +27,6 @@ from rodif_core.errors import LearningError
 from rodif_core.policies.checkpoint import Checkpoint, SupportSet
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig
-from rodif_core.policies.resnet import ImageEncoder
 from rodif_core.presets import PretrainConfig
 from rodif_core.rollout import rollout
 from rodif_core.spec import RolloutConfig, TaskName
@@ -125,25 +124,16 @@ def pretrain(
         )  # fmt: skip
     shape = config.policy_config(task) if start is None else start.policy.config
     seen, unseen = (encode(task, shape, encoder, part, kept_rows) for part in (known, held_out))
-    if start is None:
-        policy = _fresh(shape, seen, encoder, config)
-    else:
-        policy = replace(start.policy.copy(), encoder=encoder)
+    policy = start.policy.copy() if start else _fresh(shape, seen, config)
+    policy = replace(policy, encoder=encoder)
     support = _support(known, held_out, policy)
+    length = config.updates if start is None else config.round_updates
+    success_of = partial(_success, task_name, support, track) if track else None
     average, curves = _train(
-        policy,
-        seen,
-        unseen,
-        config if start is None else replace(config, updates=config.round_updates),
-        workspace,
-        device,
-        precision,
-        partial(_success, task_name, support, track) if track else None,
-        progress,
-    )
-    curves["encoder_curve"] = encoder_curve
-    if start is not None:
-        curves |= _earlier_curves(start, encoder_curve)
+        policy, seen, unseen, replace(config, updates=length), workspace, device, precision,
+        success_of, progress,
+    )  # fmt: skip
+    curves |= _earlier_curves(start, encoder_curve) if start else {"encoder_curve": encoder_curve}
     facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
     card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
     return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
@@ -204,16 +194,13 @@ def _support(
 
 
 def _fresh(
-    shape: PolicyConfig,
-    known: Sequence[Trajectory],
-    encoder: ImageEncoder | None,
-    config: PretrainConfig,
+    shape: PolicyConfig, known: Sequence[Trajectory], config: PretrainConfig
 ) -> DiffusionPolicy:
-    """Untrained weights, but for the encoder, that depend on the seed alone."""
+    """Untrained weights that depend on the seed alone."""
     normaliser = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return replace(DiffusionPolicy.build(shape, normaliser), encoder=encoder)
+        return DiffusionPolicy.build(shape, normaliser)
 
 
 def _train(

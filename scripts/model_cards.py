@@ -29,7 +29,7 @@ CPU_MINUTES = {
     "aligning": 57,
     "aligning-state": 9,
     "stacking": 150,
-    "stacking-state": 50,
+    "stacking-state": 75,
 }
 
 HEAD = """# Shipped policies
