@@ -176,9 +176,7 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     },
     ("stacking", "cpu"): {
         "images": ImageConfig(),
-        "encoder": EncoderConfig(
-            moments=20_000, rearranged=40_000, updates=6_000, round_updates=3_000
-        ),
+        "encoder": EncoderConfig(moments=24_000, updates=5_000),
         "rounds": 4,
     },
     **{

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from typing import Any
 
 import pytest
 
@@ -30,8 +31,18 @@ def test_a_shipped_policy_was_trained_with_todays_preset(task: TaskName):
     today = json.loads(json.dumps(asdict(preset_for(task, "cpu"))))
     if "channels" in trained:  # Avoid's card, of a time when there was one architecture only
         trained["size"] = today["size"] | {"channels": trained.pop("channels")}
-    # Older cards do not know the settings that came later; those must not have changed a thing.
-    assert {name: today.get(name) for name in trained} == trained
+    assert _known(today, trained) == trained
+
+
+def _known(today: dict[str, Any], trained: dict[str, Any]) -> dict[str, Any]:
+    """Today's settings as far as a card knows them.
+
+    Those that came later are missing on older cards, and must not have changed a thing.
+    """
+    return {
+        name: _known(today[name], was) if isinstance(was, dict) else today.get(name)
+        for name, was in trained.items()
+    }
 
 
 @pytest.mark.parametrize("task", shipped_tasks())
