@@ -26,6 +26,7 @@ from rodif_core.errors import LearningError, ValueOutOfRangeError
 from rodif_core.moments import Moments
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.resnet import ImageConfig, ImageEncoder
+from rodif_core.policies.telling import Telling
 from rodif_core.tasks.base import Task
 from rodif_core.training_state import (
     Precision,
@@ -40,7 +41,6 @@ from rodif_core.trajectory import Trajectory
 SAVE_EVERY = 250  # updates between partial states
 REPORT_EVERY = 50
 HELD_OUT_MOMENTS = 256
-HEAD_WIDTH = 128  # hidden units between the features and what they are to tell
 
 
 @dataclass(frozen=True)
@@ -65,22 +65,28 @@ class EncoderConfig:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 0")
 
 
-class _Telling(nn.Module):
-    """Encoder and head: from pictures and proprioception to the hidden part of the state."""
+class _Lesson(nn.Module):
+    """Encoder and head: from pictures and proprioception to the hidden part of the state.
+
+    The head is the encoder's own, or one that is thrown away when it has told what it was for.
+    """
 
     def __init__(self, images: ImageConfig, felt: int, hidden: int) -> None:
         super().__init__()
-        self.encoder = ImageEncoder(images)
-        self.head = nn.Sequential(
-            nn.Linear(felt + images.feature_dim, HEAD_WIDTH),
-            nn.ReLU(),
-            nn.Linear(HEAD_WIDTH, hidden),
-        )
+        self.encoder = ImageEncoder(images, felt)
+        self.passing = None if images.told else Telling(felt, images.coordinates, hidden)
+
+    @property
+    def head(self) -> Telling:
+        """The encoder's, if it has one."""
+        head = self.encoder.telling or self.passing
+        assert head is not None  # one of them is always there
+        return head
 
     def error(self, frames: Tensor, felt: Tensor, hidden: Tensor) -> Tensor:
         """Mean squared error of what is told, in units of the observations' half ranges."""
-        rows = self.encoder(felt[:, None], frames[:, None])[:, 0]
-        return F.mse_loss(self.head(rows), hidden)
+        seen = self.encoder.look(frames[:, None])[:, 0]
+        return F.mse_loss(self.head.normalised(felt, seen), hidden)
 
 
 def train_encoder(
@@ -100,20 +106,23 @@ def train_encoder(
 ) -> tuple[ImageEncoder, list[dict[str, float]]]:
     """A trained encoder and its curve; goes on from `workspace` when a partial state is there.
 
-    start   go on from this encoder for `config.round_updates`, after a warm-up in which only the
-            new head learns, as that would else spoil what the encoder knows
+    start   go on from this encoder for `config.round_updates`; where its head was thrown away,
+            after a warm-up in which only a new one learns, as that would else spoil what it knows
     driven  rollouts of a policy, where half of the moments are then drawn
 
     Raises LearningError when the loss is not finite and GraphicsError where nothing can be drawn.
     """
+    told = start.telling if start is not None else None
     states = Normaliser.fit([d.observations for d in known], [d.actions for d in known])
+    states = states if told is None else told.kept_scale()
     chance = np.random.default_rng([seed, 3])  # apart from the split's and the weights'
     seen = _moments(task, known, driven, images, states, config, chance)
     unseen = Moments.draw(task, held_out, images, states, HELD_OUT_MOMENTS)
-    model = _model(images, seen, start, seed).to(device)
+    model = _model(images, seen, states, start, seed).to(device)
     updates, waiting = config.updates, 0
     if start is not None:
-        updates, waiting = config.round_updates, min(config.warm_up, config.round_updates // 2)
+        updates = config.round_updates
+        waiting = 0 if told is not None else min(config.warm_up, updates // 2)
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
@@ -139,11 +148,14 @@ def train_encoder(
     return model.encoder.cpu().eval().requires_grad_(False), curve
 
 
-def _model(images: ImageConfig, seen: Moments, start: ImageEncoder | None, seed: int) -> _Telling:
+def _model(
+    images: ImageConfig, seen: Moments, states: Normaliser, start: ImageEncoder | None, seed: int
+) -> _Lesson:
     """With weights that depend on the seed alone, but for those that are known."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = _Telling(images, seen.felt.shape[1], seen.hidden.shape[1])
+        model = _Lesson(images, seen.felt.shape[1], seen.hidden.shape[1])
+    model.head.keep_scale(states)
     if start is not None:
         model.encoder.load_state_dict(start.state_dict())
     return model
@@ -177,7 +189,7 @@ def _moments(
 
 @torch.no_grad()
 def _report(
-    model: _Telling, loss: float, unseen: Moments, update: int, device: str
+    model: _Lesson, loss: float, unseen: Moments, update: int, device: str
 ) -> dict[str, float]:
     if not math.isfinite(loss):
         raise LearningError(f"the encoder's loss became {loss} at update {update}")

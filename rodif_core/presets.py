@@ -44,6 +44,7 @@ class PretrainConfig:
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
     encoder: EncoderConfig = EncoderConfig()  # how their encoder is trained
+    begin_with: TaskName | None = None  # go on from the shipped policy of this task
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -62,7 +63,8 @@ class PretrainConfig:
     def policy_config(self, task: Task) -> PolicyConfig:
         """The policy's shape for a task.
 
-        Raises ValueOutOfRangeError for pictures of a task without cameras, and the reverse.
+        Raises ValueOutOfRangeError for pictures of a task without cameras, the reverse, and
+        pictures that tell more or less than the task hides.
         """
         cameras = self.images.cameras if self.images else 0
         if cameras != len(task.cameras):
@@ -73,6 +75,9 @@ class PretrainConfig:
             )
         rows = task.observation_dim
         if self.images is not None:
+            hidden = task.observation_dim - task.proprioception_dim
+            if self.images.told not in (0, hidden):
+                raise ValueOutOfRangeError("told", self.images.told, f"0 or {hidden}")
             rows = task.proprioception_dim + self.images.feature_dim
         return PolicyConfig(
             rows,

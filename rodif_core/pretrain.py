@@ -31,6 +31,7 @@ from rodif_core.presets import PretrainConfig
 from rodif_core.rollout import rollout
 from rodif_core.spec import RolloutConfig, TaskName
 from rodif_core.tasks import get_task
+from rodif_core.tasks.base import Task
 from rodif_core.training_state import (
     Precision,
     UpdateProgress,
@@ -97,7 +98,9 @@ def pretrain(
 
     start      go on from this policy, with its size and normaliser, for `config.round_updates`,
                instead of from fresh weights for `config.updates`; its encoder, if it has one,
-               learns on for `config.encoder.round_updates`, also from what it met when `driven`
+               learns on for `config.encoder.round_updates`, also from what it met when `driven`.
+               May be the policy of a task that is told what this one only sees, where pictures
+               tell the state
     kept_rows  folder for encoded pictures, which trainings with the same encoder may share
     precision  of the forward passes; by default mixed on a GPU
     track      rollouts of the policy after each of the first four fifths of the training; their
@@ -122,10 +125,10 @@ def pretrain(
             seed=config.seed, start=encoder, driven=driven, workspace=workspace, device=device,
             precision=precision, progress=progress,
         )  # fmt: skip
-    shape = config.policy_config(task) if start is None else start.policy.config
+    shape = _shape(task, start, config)
     seen, unseen = (encode(task, shape, encoder, part, kept_rows) for part in (known, held_out))
     policy = start.policy.copy() if start else _fresh(shape, seen, config)
-    policy = replace(policy, encoder=encoder)
+    policy = replace(policy, config=shape, encoder=encoder)
     support = _support(known, held_out, policy)
     length = config.updates if start is None else config.round_updates
     success_of = partial(_success, task_name, support, track) if track else None
@@ -133,7 +136,7 @@ def pretrain(
         policy, seen, unseen, replace(config, updates=length), workspace, device, precision,
         success_of, progress,
     )  # fmt: skip
-    curves |= _earlier_curves(start, encoder_curve) if start else {"encoder_curve": encoder_curve}
+    curves |= _other_curves(task_name, start, encoder_curve)
     facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
     card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
     return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
@@ -164,9 +167,13 @@ def _deciding(config: PretrainConfig) -> dict[str, Any]:
     return {k: v for k, v in asdict(config).items() if k not in following}
 
 
-def _earlier_curves(start: Checkpoint, encoder_curve: Any | None) -> dict[str, Any]:
-    """What the card of a policy that another one goes on from says about its trainings; of the
-    encoder there too, once it has learned on."""
+def _other_curves(
+    task_name: TaskName, start: Checkpoint | None, encoder_curve: Any | None
+) -> dict[str, Any]:
+    """The encoder's curve and, on the card of a policy that another one of the task goes on from,
+    what its card says about its trainings; of the encoder there too, once it has learned on."""
+    if start is None or start.task != task_name:
+        return {"encoder_curve": encoder_curve}
     names = ["held_out_curve", "rollout_curve"] + (["encoder_curve"] if encoder_curve else [])
     before = {name: start.card[name] for name in names if name in start.card}
     return {
@@ -180,6 +187,12 @@ def _fingerprint(demonstrations: Sequence[Trajectory]) -> str:
     for one in demonstrations:
         digest.update(one.observations.tobytes() + one.actions.tobytes())
     return digest.hexdigest()[:16]
+
+
+def _shape(task: Task, start: Checkpoint | None, config: PretrainConfig) -> PolicyConfig:
+    """The start's, which gets eyes if it was told the state until now."""
+    fresh = config.policy_config(task)
+    return fresh if start is None else replace(start.policy.config, images=config.images)
 
 
 def _support(

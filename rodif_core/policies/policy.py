@@ -91,7 +91,8 @@ class PolicyConfig:
         if self.architecture is not Architecture.UNET:
             plain["architecture"] = self.architecture.value
         if images is not None:
-            plain["images"] = images
+            # Nor those from before pictures could be told as a state.
+            plain["images"] = {k: v for k, v in images.items() if k != "told" or v}
         return plain | {k: list(v) if isinstance(v, tuple) else v for k, v in sizes.items()}
 
     @classmethod
@@ -146,7 +147,9 @@ class DiffusionPolicy:
     def build(cls, config: PolicyConfig, normaliser: Normaliser) -> DiffusionPolicy:
         """A policy with fresh weights (from torch's current random state)."""
         denoiser = build_denoiser(config)
-        encoder = ImageEncoder(config.images) if config.images else None
+        encoder = None
+        if config.images is not None:
+            encoder = ImageEncoder(config.images, config.proprioception_dim)
         schedule = NoiseSchedule(config.denoising_steps, config.clip, config.std_floor)
         return cls(config, denoiser, schedule, normaliser, encoder)
 
@@ -158,7 +161,7 @@ class DiffusionPolicy:
         """Observation rows of a policy with images, in task units, each frame encoded once.
 
         proprioception (B, T, P) in task units, frames uint8 RGB (B, T, C, H, W, 3) → (B, T, O).
-        Differentiable; the features are within ±1. Raises LearningError for a policy without
+        Differentiable. Raises LearningError for a policy without
         images.
         """
         if self.encoder is None:

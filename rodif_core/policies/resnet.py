@@ -1,9 +1,10 @@
 """Camera images as features: one ResNet-18 a camera (He et al. 2016), trained from scratch.
 
-Legend: N images, B rows, T frames in a row, C cameras, F features of a camera, P proprioception
-dims. Group instead of batch normalisation, because batches are small and weights are averaged;
-spatial soft-argmax (Finn et al. 2016) instead of pooling, because the task is to know *where*
-things are: each feature map becomes its expected image coordinate.
+Legend: N images, B rows, T frames in a row, C cameras, P proprioception dims. Group instead of
+batch normalisation, because batches are small and weights are averaged; spatial soft-argmax (Finn
+et al. 2016) instead of pooling, because the task is to know *where* things are: each feature map
+becomes its expected image coordinate. These are the features, or what a head tells of the state
+from them (`telling.py`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.policies.telling import Telling
 
 GROUP_CHANNELS = 16  # channels that share a normalisation; all of them where there are fewer
 STAGES = ((1, 1), (2, 2), (4, 2), (8, 2))  # width factor and stride of ResNet-18's four stages
@@ -28,11 +30,14 @@ class ImageConfig:
     pixels: int = 96  # height and width
     width: int = 16  # channels of the first stage
     keypoints: int = 32  # feature maps whose coordinates are the features
+    told: int = 0  # numbers of the state that are told from the keypoints and are then the features
 
     def __post_init__(self) -> None:
         for name in ("cameras", "keypoints"):
             if getattr(self, name) < 1:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
+        if self.told < 0:
+            raise ValueOutOfRangeError("told", self.told, "at least 0")
         if self.pixels < 2 * SHRINK or self.pixels % SHRINK:
             legal = f"a multiple of {SHRINK}, at least {2 * SHRINK}"
             raise ValueOutOfRangeError("pixels", self.pixels, legal)
@@ -42,9 +47,14 @@ class ImageConfig:
             )
 
     @property
-    def feature_dim(self) -> int:
-        """Features of all cameras together: two coordinates a keypoint."""
+    def coordinates(self) -> int:
+        """Of the keypoints of all cameras together."""
         return 2 * self.keypoints * self.cameras
+
+    @property
+    def feature_dim(self) -> int:
+        """What a policy reads of the pictures: what they tell, or the keypoints' coordinates."""
+        return self.told or self.coordinates
 
 
 def normalisation(channels: int) -> nn.GroupNorm:
@@ -114,10 +124,11 @@ class ImageEncoder(nn.Module):
     """Proprioception and camera frames as the observation rows that every denoiser reads.
 
     Call it once for the frames of a window: neither the K denoising steps of a chain nor several
-    noise draws for one window need the images again.
+    noise draws for one window need the images again. `felt`: how many numbers proprioception has;
+    only an encoder that tells the state needs to know.
     """
 
-    def __init__(self, config: ImageConfig) -> None:
+    def __init__(self, config: ImageConfig, felt: int = 0) -> None:
         super().__init__()
         self.config = config
         self.cameras = nn.ModuleList(
@@ -126,13 +137,14 @@ class ImageEncoder(nn.Module):
             )
             for _ in range(config.cameras)
         )
+        self.telling = Telling(felt, config.coordinates, config.told) if config.told else None
 
-    def forward(self, proprioception: Tensor, frames: Tensor) -> Tensor:
-        """(B, T, P) and uint8 RGB (B, T, C, H, W, 3) → (B, T, P + C · F), P first.
+    def look(self, frames: Tensor) -> Tensor:
+        """Keypoints (B, T, `coordinates`) in -1 … 1 of uint8 RGB (B, T, C, H, W, 3).
 
         Raises ValueOutOfRangeError for frames of another type or shape.
         """
-        batch, steps = proprioception.shape[:2]
+        batch, steps = frames.shape[:2]
         pixels = self.config.pixels
         shape = (batch, steps, self.config.cameras, pixels, pixels, 3)
         if frames.dtype != torch.uint8 or tuple(frames.shape) != shape:
@@ -141,6 +153,15 @@ class ImageEncoder(nn.Module):
             )
         # To the weights' type and device, and to -1 … 1.
         images = frames.flatten(0, 1).permute(1, 0, 4, 2, 3).to(next(self.parameters())) / 127.5 - 1
-        features = [camera(view) for camera, view in zip(self.cameras, images, strict=True)]
-        seen = torch.cat(features, dim=1).unflatten(0, (batch, steps))
+        found = [camera(view) for camera, view in zip(self.cameras, images, strict=True)]
+        return torch.cat(found, dim=1).unflatten(0, (batch, steps))
+
+    def forward(self, proprioception: Tensor, frames: Tensor) -> Tensor:
+        """(B, T, P) in task units and uint8 RGB (B, T, C, H, W, 3) → (B, T, P + features), P first.
+
+        Raises ValueOutOfRangeError for frames of another type or shape.
+        """
+        seen = self.look(frames)
+        if self.telling is not None:
+            seen = self.telling(proprioception, seen)
         return torch.cat([proprioception, seen], dim=-1)

@@ -113,9 +113,9 @@ def run(args: argparse.Namespace) -> int:
 def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> Checkpoint:
     """The first training and the rounds after it, each on all that experts have shown so far."""
     from rodif_core.demonstrations import make_demonstrations
+    from rodif_core.policies.checkpoint import load_checkpoint
     from rodif_core.pretrain import pretrain
-    from rodif_core.recoveries import make_recoveries
-    from rodif_core.rollout import rollout
+    from rodif_core.shipped import shipped_checkpoint
     from rodif_core.tasks import get_task
     from rodif_core.training_state import Precision, check_device
 
@@ -130,18 +130,18 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         progress=lambda done, _: bar.update(making, completed=done),
     )
     checkpoint = None
+    if config.begin_with is not None:
+        checkpoint = load_checkpoint(shipped_checkpoint(config.begin_with))
     driven: list[Trajectory] = []
     on_the_way: list[float] = []  # success of the policies that experts took over from
     for number in range(config.rounds + 1):
         if checkpoint is not None:
-            first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
-            drives = config.recoveries * config.drives
-            driven = rollout(checkpoint, RolloutConfig(episodes=drives, seed=first_seed))
-            on_the_way.append(sum(one.success for one in driven) / len(driven))
-            bar.console.print(f"before round {number}: success {on_the_way[-1]:.1%}")
-            count = config.recoveries if config.drives > 1 else None
-            shown += make_recoveries(task, driven, args.preferred_share, count)
-        updates = config.round_updates if number else config.updates
+            driven, recoveries = _take_over(args, config, checkpoint, number)
+            shown += recoveries
+            succeeded = sum(one.success for one in driven) / len(driven)
+            bar.console.print(f"before round {number}: success {succeeded:.1%}")
+            on_the_way += [succeeded] if number else []  # the policy begun with is another task's
+        updates = config.updates if checkpoint is None else config.round_updates
         training = bar.add_task(f"training {number}", total=updates)
 
         workspace = None
@@ -169,6 +169,21 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         "success_before_rounds": on_the_way,
     }
     return replace(checkpoint, card=checkpoint.card | facts)
+
+
+def _take_over(
+    args: argparse.Namespace, config: PretrainConfig, checkpoint: Checkpoint, number: int
+) -> tuple[list[Trajectory], list[Trajectory]]:
+    """What the policy did in its rollouts, and how experts went on from there."""
+    from rodif_core.recoveries import make_recoveries
+    from rodif_core.rollout import rollout
+    from rodif_core.tasks import get_task
+
+    first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
+    drives = config.recoveries * config.drives
+    driven = rollout(checkpoint, RolloutConfig(episodes=drives, seed=first_seed))
+    count = config.recoveries if config.drives > 1 else None
+    return driven, make_recoveries(get_task(args.task), driven, args.preferred_share, count)
 
 
 def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
