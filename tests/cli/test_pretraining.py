@@ -6,36 +6,64 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from rich.progress import Progress
 
+from rodif_core import rollout as rollouts
 from rodif_core.encoder_training import EncoderConfig
-from rodif_core.policies.checkpoint import load_checkpoint
+from rodif_core.errors import LearningError
+from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
 from rodif_core.policies.resnet import ImageConfig
 from rodif_core.presets import preset_for
 from rodif_core.shipped import shipped_checkpoint
-from rodif_core.spec import TaskName
+from rodif_core.spec import RolloutConfig, TaskName
+from rodif_core.trajectory import Trajectory
 from worker.cli import pretrain
+
+TASK, TOLD = TaskName.ALIGNING, TaskName.ALIGNING_STATE
+CONFIG = replace(
+    preset_for(TOLD, "cpu"), begin_with=TOLD, rounds=1, recoveries=3, round_updates=5,
+    images=ImageConfig(pixels=64, width=4, keypoints=4, told=14),
+    encoder=EncoderConfig(moments=50, updates=3, round_updates=2, batch_size=8),
+)  # fmt: skip
+
+
+def trained(workspace: Path, **changes: int) -> Checkpoint:
+    args = argparse.Namespace(
+        task=TASK.value, demonstrations=4, preferred_share=None, seed=0, device="cpu",
+        precision=None, workspace=workspace, track=0,
+    )  # fmt: skip
+    with Progress(disable=True) as bar:
+        return pretrain._train(args, replace(CONFIG, **changes), bar)
 
 
 def test_policy_that_was_told_the_state_is_begun_with(tmp_path: Path):
-    task, told = TaskName.ALIGNING, TaskName.ALIGNING_STATE
-    config = replace(
-        preset_for(told, "cpu"), begin_with=told, rounds=1, recoveries=3, round_updates=5,
-        images=ImageConfig(pixels=64, width=4, keypoints=4, told=14),
-        encoder=EncoderConfig(moments=50, updates=3, batch_size=8),
-    )  # fmt: skip
-    args = argparse.Namespace(
-        task=task.value, demonstrations=4, preferred_share=None, seed=0, device="cpu",
-        precision=None, workspace=tmp_path, track=0,
-    )  # fmt: skip
-    with Progress(disable=True) as bar:
-        made = pretrain._train(args, config, bar)
-    assert made.task is task
+    made = trained(tmp_path)
+    assert made.task is TASK
     assert made.card["demonstrations"] > 4  # takeovers from the policy begun with are among them
     assert made.card["recoveries"] == made.card["demonstrations"] - 4
     assert len(made.card["success_before_rounds"]) == 1  # of its own, not of the other task's
-    assert made.card["preset"]["begin_with"] == told.value
-    begun = load_checkpoint(shipped_checkpoint(told)).digest
+    assert made.card["preset"]["begin_with"] == TOLD.value
+    begun = load_checkpoint(shipped_checkpoint(TOLD)).digest
     first = (tmp_path / "round-0" / "training.json").read_text()
     assert begun in first and made.card["start"] not in first
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["round-0", "round-1", "rows"]
+
+
+def test_broken_run_goes_on_without_driving_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    driven: list[int] = []
+    drive = rollouts.rollout
+
+    def count(checkpoint: Checkpoint, config: RolloutConfig) -> list[Trajectory]:
+        driven.append(config.episodes)
+        return drive(checkpoint, config)
+
+    monkeypatch.setattr(rollouts, "rollout", count)
+    whole = trained(tmp_path)
+    assert driven == [3, 3]
+    (tmp_path / "round-1" / "pretrain.safetensors").unlink(missing_ok=True)
+    assert trained(tmp_path).digest == whole.digest
+    assert driven == [3, 3]
+    # Other sizes are another drive, and then another training.
+    with pytest.raises(LearningError, match="partial state of another training"):
+        trained(tmp_path, recoveries=4)
+    assert driven == [3, 3, 4]

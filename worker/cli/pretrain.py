@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -143,18 +144,13 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             on_the_way += [succeeded] if number else []  # the policy begun with is another task's
         updates = config.updates if checkpoint is None else config.round_updates
         training = bar.add_task(f"training {number}", total=updates)
-
-        workspace = None
-        if args.workspace is not None:
-            workspace = args.workspace / f"round-{number}"
-            workspace.mkdir(parents=True, exist_ok=True)
         checkpoint = pretrain(
             TaskName(args.task),
             shown,
             config,
             start=checkpoint,
             driven=driven,
-            workspace=workspace,
+            workspace=_round_folder(args, number),
             kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
             precision=Precision(args.precision) if args.precision else None,
@@ -171,19 +167,46 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     return replace(checkpoint, card=checkpoint.card | facts)
 
 
+def _round_folder(args: argparse.Namespace, number: int) -> Path | None:
+    """Where a round keeps what it has done so far, if it is to."""
+    if args.workspace is None:
+        return None
+    folder: Path = args.workspace / f"round-{number}"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def _take_over(
     args: argparse.Namespace, config: PretrainConfig, checkpoint: Checkpoint, number: int
 ) -> tuple[list[Trajectory], list[Trajectory]]:
-    """What the policy did in its rollouts, and how experts went on from there."""
+    """What the policy did in its rollouts, and how experts went on from there.
+
+    Both stay in the workspace: with pictures they take longer than a training.
+    """
+    from rodif_core.demonstrations import load_demonstrations, save_demonstrations
     from rodif_core.recoveries import make_recoveries
     from rodif_core.rollout import rollout
     from rodif_core.tasks import get_task
 
+    folder, files = _round_folder(args, number), []
+    if folder is not None:
+        sizes = f"{config.recoveries}x{config.drives}.npz"
+        files = [folder / f"driven-{sizes}", folder / f"recoveries-{sizes}"]
+    if files and all(file.exists() for file in files):
+        driven, recoveries = (load_demonstrations(file) for file in files)
+        if driven[0].info["checkpoint"] == checkpoint.digest:
+            return driven, recoveries
     first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
     drives = config.recoveries * config.drives
     driven = rollout(checkpoint, RolloutConfig(episodes=drives, seed=first_seed))
     count = config.recoveries if config.drives > 1 else None
-    return driven, make_recoveries(get_task(args.task), driven, args.preferred_share, count)
+    recoveries = make_recoveries(get_task(args.task), driven, args.preferred_share, count)
+    if recoveries:
+        for file, episodes in zip(files, (driven, recoveries), strict=False):
+            partial = file.with_suffix(".partial")  # a kill leaves no file that is cut short
+            save_demonstrations(partial, episodes)
+            os.replace(partial, file)
+    return driven, recoveries
 
 
 def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
