@@ -81,39 +81,58 @@ def _row(checkpoint: Checkpoint) -> str:
 
 def _card(checkpoint: Checkpoint) -> str:
     name, card, config = checkpoint.task.value, checkpoint.card, checkpoint.policy.config
-    preset = card["preset"]
     weights = sum(value.numel() for value in checkpoint.policy.denoiser.parameters())
-    seen = ""
-    if checkpoint.policy.encoder is not None:
-        weights_seen = sum(value.numel() for value in checkpoint.policy.encoder.parameters())
-        encoder = preset["encoder"]
-        seen = (
-            f" The encoder of its {config.images.cameras if config.images else 0} cameras has"
-            f" {weights_seen:,} weights and saw {encoder['moments']:,} moments in"
-            f" {encoder['updates']:,} updates of {encoder['batch_size']}."
-        )
     shape = (
         f"history {config.observation_steps}, chunk {config.predicted_steps},"
         f" executed {config.executed_steps}, K = {config.denoising_steps}"
     )
     shown = card["demonstrations"] - card.get("recoveries", 0)
-    data = (
-        f"{shown:,} scripted demonstrations,"
-        f" {preset['updates']:,} updates of {preset['batch_size']} rows"
-    )
-    if card.get("rounds"):
-        data += (
-            f"; then {card['rounds']} rounds of {preset['round_updates']:,} updates, each on what"
-            f" experts did after takeovers too ({card['recoveries']} in all)"
-        )
+    data = _data(card, shown)
+    if checkpoint.policy.encoder is not None:
+        data += _seen(checkpoint)
     return (
         f"\n## {name}\n"
-        f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}.{seen}"
+        f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}"
         f" Up to {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
         f"```\nrodif pretrain {name} --preset cpu --demonstrations {shown}"
         f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
     )
+
+
+def _data(card: dict[str, Any], shown: int) -> str:
+    """What the denoiser learned from."""
+    preset = card["preset"]
+    rows, rounds = f"{preset['batch_size']} rows", card.get("rounds", 0)
+    if preset.get("begin_with"):
+        return (
+            f"Begins with the shipped `{preset['begin_with']}`, whose state it sees from then on;"
+            f" {shown:,} scripted demonstrations and what experts did after takeovers"
+            f" ({card['recoveries']} in all), {1 + rounds} rounds of"
+            f" {preset['round_updates']:,} updates of {rows}."
+        )
+    data = f"{shown:,} scripted demonstrations, {preset['updates']:,} updates of {rows}"
+    if rounds:
+        data += (
+            f"; then {rounds} rounds of {preset['round_updates']:,} updates, each on what"
+            f" experts did after takeovers too ({card['recoveries']} in all)"
+        )
+    return data + "."
+
+
+def _seen(checkpoint: Checkpoint) -> str:
+    """What the encoder learned from."""
+    images, encoder = checkpoint.policy.config.images, checkpoint.policy.encoder
+    assert images is not None and encoder is not None  # who calls has looked
+    weights = sum(value.numel() for value in encoder.parameters())
+    config = checkpoint.card["preset"]["encoder"]
+    told = (
+        f" The encoder of its {images.cameras} cameras has {weights:,} weights and saw"
+        f" {config['moments'] + config.get('rearranged', 0):,} moments in {config['updates']:,}"
+        f" updates of {config['batch_size']}"
+    )
+    rounds, further = checkpoint.card["rounds"], config.get("round_updates", 0)
+    return told + (f", and in each round as many in {further:,}." if further and rounds else ".")
 
 
 def _modes(checkpoint: Checkpoint) -> str:
