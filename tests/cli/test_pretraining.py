@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.progress import Progress
@@ -31,7 +32,7 @@ CONFIG = replace(
 def trained(workspace: Path, **changes: int) -> Checkpoint:
     args = argparse.Namespace(
         task=TASK.value, demonstrations=4, preferred_share=None, seed=0, device="cpu",
-        precision=None, workspace=workspace, track=0,
+        precision=None, workspace=workspace, track=0, processes=1,
     )  # fmt: skip
     with Progress(disable=True) as bar:
         return pretrain._train(args, replace(CONFIG, **changes), bar)
@@ -53,9 +54,11 @@ def test_broken_run_goes_on_without_driving_again(tmp_path: Path, monkeypatch: p
     driven: list[int] = []
     drive = rollouts.rollout
 
-    def count(checkpoint: Checkpoint, config: RolloutConfig) -> list[Trajectory]:
+    def count(
+        checkpoint: Checkpoint, config: RolloutConfig, *, progress: Any = None
+    ) -> list[Trajectory]:
         driven.append(config.episodes)
-        return drive(checkpoint, config)
+        return drive(checkpoint, config, progress=progress)
 
     monkeypatch.setattr(rollouts, "rollout", count)
     whole = trained(tmp_path)

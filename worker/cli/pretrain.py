@@ -42,7 +42,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="share of demonstrations in the preferred group, for avoid: on the left"
         " (default: the task's)",
     )
-    parser.add_argument("--updates", type=int, help="default: the preset's")
+    parser.add_argument(
+        "--updates",
+        type=int,
+        help="of a training from fresh weights; one that begins with another task's policy, as"
+        " with pictures, has the updates of a round (default: the preset's)",
+    )
     parser.add_argument(
         "--executed-steps", type=int, help="control steps between two decisions (default: preset's)"
     )
@@ -63,6 +68,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--round-updates", type=int, help="of a round (default: the preset's)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--processes", type=int, default=1, help="cores for rollouts (default %(default)s)"
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda (default %(default)s)")
     parser.add_argument(
         "--precision",
@@ -89,6 +97,8 @@ def run(args: argparse.Namespace) -> int:
     for name in ("evaluate", "track"):
         if getattr(args, name) < 0:
             raise ValueOutOfRangeError(name, getattr(args, name), "at least 0")
+    if args.processes < 1:
+        raise ValueOutOfRangeError("processes", args.processes, "at least 1")
 
     from rich.console import Console
     from rich.progress import Progress
@@ -104,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     with Progress(console=console) as bar:
         checkpoint = _train(args, config, bar)
         if args.evaluate:
-            checkpoint = _measure(checkpoint, args.evaluate, bar)
+            checkpoint = _measure(checkpoint, args.evaluate, args.processes, bar)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_bytes(save_checkpoint(checkpoint))
     print(f"{args.out}  {args.out.stat().st_size} bytes  digest {checkpoint.digest}")
@@ -185,8 +195,8 @@ def _take_over(
     """
     from rodif_core.demonstrations import load_demonstrations, save_demonstrations
     from rodif_core.recoveries import make_recoveries
-    from rodif_core.rollout import rollout
     from rodif_core.tasks import get_task
+    from worker.parallel import parallel_rollout
 
     folder, files = _round_folder(args, number), []
     if folder is not None:
@@ -198,7 +208,8 @@ def _take_over(
             return driven, recoveries
     first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
     drives = config.recoveries * config.drives
-    driven = rollout(checkpoint, RolloutConfig(episodes=drives, seed=first_seed))
+    settings = RolloutConfig(episodes=drives, seed=first_seed)
+    driven = parallel_rollout(checkpoint, settings, args.processes)
     count = config.recoveries if config.drives > 1 else None
     recoveries = make_recoveries(get_task(args.task), driven, args.preferred_share, count)
     if recoveries:
@@ -224,17 +235,20 @@ def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
     return show
 
 
-def _measure(checkpoint: Checkpoint, episodes: int, bar: Progress) -> Checkpoint:
+def _measure(checkpoint: Checkpoint, episodes: int, processes: int, bar: Progress) -> Checkpoint:
     """The same checkpoint with a measurement on its card."""
-    from rodif_core.evaluate import evaluate
+    from rodif_core.evaluate import summarise
     from worker.cli.tables import evaluation_table
+    from worker.parallel import parallel_rollout
 
     rolling = bar.add_task("rollouts", total=episodes)
-    measured = evaluate(
+    rollouts = parallel_rollout(
         checkpoint,
         RolloutConfig(episodes=episodes),
+        processes,
         progress=lambda done, _: bar.update(rolling, completed=done),
-    ).to_json()
+    )
+    measured = summarise(checkpoint, rollouts).to_json()
     kept = {k: v for k, v in measured.items() if k not in ("paths", "path_groups")}
     table = evaluation_table(f"{checkpoint.task.value}, seed 0 on", [("new", measured)])
     bar.console.print(table)
