@@ -44,7 +44,8 @@ class PretrainConfig:
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
     encoder: EncoderConfig = EncoderConfig()  # how their encoder is trained
-    begin_with: TaskName | None = None  # go on from the shipped policy of this task
+    begin_with: TaskName | None = None  # go on from the shipped policy of this task …
+    looks: int = 0  # … first with so many trainings of the encoder alone
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -56,6 +57,9 @@ class PretrainConfig:
             raise ValueOutOfRangeError("ema_decay", self.ema_decay, "in [0, 1)")
         least = {"updates": 1, "round_updates": 1, "recoveries": 1, "drives": 1}
         least |= {"rounds": 0, "batch_size": 1}
+        if self.looks < 0 or (self.looks and self.begin_with is None):
+            legal = "at least 0, and 0 without a policy to begin with"
+            raise ValueOutOfRangeError("looks", self.looks, legal)
         for name, value in (least | {"warm_up": 0, "weight_decay": 0}).items():
             if getattr(self, name) < value:
                 raise ValueOutOfRangeError(name, getattr(self, name), f"at least {value}")

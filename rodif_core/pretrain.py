@@ -87,6 +87,7 @@ def pretrain(
     *,
     start: Checkpoint | None = None,
     driven: Sequence[Trajectory] = (),
+    only_encoder: bool = False,
     workspace: Path | None = None,
     kept_rows: Path | None = None,
     device: str = "cpu",
@@ -94,28 +95,26 @@ def pretrain(
     track: int = 0,
     progress: UpdateProgress | None = None,
 ) -> Checkpoint:
-    """Train a policy on demonstrations; goes on from `workspace` when a partial state is there.
+    """A policy (averaged weights) trained on demonstrations; goes on from states in `workspace`.
 
-    start      go on from this policy, with its size and normaliser, for `config.round_updates`,
-               instead of from fresh weights for `config.updates`; its encoder, if it has one,
-               learns on for `config.encoder.round_updates`, also from what it met when `driven`.
-               May be the policy of a task that is told what this one only sees, where pictures
-               tell the state
-    kept_rows  folder for encoded pictures, which trainings with the same encoder may share
-    precision  of the forward passes; by default mixed on a GPU
-    track      rollouts of the policy after each of the first four fifths of the training; their
-               success goes to `progress` and to the card's rollout_curve, not into the weights
+    start         go on from this policy, with its size and normaliser, for `config.round_updates`;
+                  its encoder, if any, learns on for `config.encoder.round_updates`, also from what
+                  was `driven`. Where pictures tell the state, may be the policy that is told it
+    only_encoder  the start's denoiser stays as it is; without a start there is none to stay
+    kept_rows     folder for encoded pictures, which trainings with the same encoder may share
+    precision     of the forward passes; by default mixed on a GPU
+    track         rollouts of the policy after each of the first four fifths of the training; their
+                  success goes to `progress` and to the card's rollout_curve, not into the weights
 
-    The result holds the averaged weights, the normaliser and the support set. Raises
-    LearningError for fewer than two demonstrations, when the loss is not finite or the workspace
-    belongs to another training, and UnknownNameError for a device that is not there.
+    Raises LearningError for fewer than two demonstrations, when the loss is not finite or the
+    workspace belongs to another training, and UnknownNameError for a device that is not there.
     """
     check_device(device)
     precision = precision or usual_precision(device)
-    basis = {"device": device, "precision": precision.value, "start": start and start.digest}
+    basis: dict[str, Any] = {"device": device, "precision": precision.value}
+    basis |= {"start": start and start.digest} | ({"only_encoder": True} if only_encoder else {})
     if workspace is not None:
-        shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
-        claim_workspace(workspace, basis | shown | _deciding(config))
+        _claim(workspace, task_name, demonstrations, basis | _deciding(config))
     task = get_task(task_name)
     known, held_out = _split(demonstrations, config)
     encoder, encoder_curve = start.policy.encoder if start else None, None
@@ -126,20 +125,39 @@ def pretrain(
             precision=precision, progress=progress,
         )  # fmt: skip
     shape = _shape(task, start, config)
+    card = _facts(config, shape, demonstrations) | basis
+    card |= _other_curves(task_name, start, encoder_curve)
+    if only_encoder and start is not None:
+        policy = replace(start.policy.copy(), config=shape, encoder=encoder)
+        return Checkpoint(task_name, policy, _support(known, held_out, policy), card)
     seen, unseen = (encode(task, shape, encoder, part, kept_rows) for part in (known, held_out))
     policy = start.policy.copy() if start else _fresh(shape, seen, config)
     policy = replace(policy, config=shape, encoder=encoder)
     support = _support(known, held_out, policy)
-    length = config.updates if start is None else config.round_updates
+    config = config if start is None else replace(config, updates=config.round_updates)
     success_of = partial(_success, task_name, support, track) if track else None
     average, curves = _train(
-        policy, seen, unseen, replace(config, updates=length), workspace, device, precision,
-        success_of, progress,
-    )  # fmt: skip
-    curves |= _other_curves(task_name, start, encoder_curve)
+        policy, seen, unseen, config, workspace, device, precision, success_of, progress
+    )
+    return Checkpoint(task_name, replace(policy, denoiser=average), support, card | curves)
+
+
+def _facts(
+    config: PretrainConfig, shape: PolicyConfig, demonstrations: Sequence[Trajectory]
+) -> dict[str, Any]:
+    """What a card says first."""
     facts = {"architecture": shape.architecture.value, "demonstrations": len(demonstrations)}
-    card = {"kind": "pretrained", **facts, "preset": asdict(config), **basis, **curves}
-    return Checkpoint(task_name, replace(policy, denoiser=average), support, card)
+    return {"kind": "pretrained", **facts, "preset": asdict(config)}
+
+
+def _claim(
+    workspace: Path,
+    task_name: TaskName,
+    demonstrations: Sequence[Trajectory],
+    deciding: dict[str, Any],
+) -> None:
+    shown = {"task": task_name.value, "demonstrations": _fingerprint(demonstrations)}
+    claim_workspace(workspace, deciding | shown)
 
 
 def _split(

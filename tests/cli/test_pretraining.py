@@ -12,10 +12,10 @@ from rich.progress import Progress
 
 from rodif_core import rollout as rollouts
 from rodif_core.encoder_training import EncoderConfig
-from rodif_core.errors import LearningError
+from rodif_core.errors import LearningError, ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
 from rodif_core.policies.resnet import ImageConfig
-from rodif_core.presets import preset_for
+from rodif_core.presets import PretrainConfig, preset_for
 from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import RolloutConfig, TaskName
 from rodif_core.trajectory import Trajectory
@@ -48,6 +48,23 @@ def test_policy_that_was_told_the_state_is_begun_with(tmp_path: Path):
     begun = load_checkpoint(shipped_checkpoint(TOLD)).digest
     first = (tmp_path / "round-0" / "training.json").read_text()
     assert begun in first and made.card["start"] not in first
+
+
+def test_first_looks_train_the_encoder_alone(tmp_path: Path):
+    made = trained(tmp_path, rounds=0, looks=2)
+    assert sorted(path.name for path in tmp_path.glob("round-*/pretrain.safetensors")) == []
+    folders = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("round"))
+    assert folders == ["round-0", "round-1", "round-2"]
+    # Encoder of two looks, and of the training that then moved the denoiser, too.
+    assert len(made.card["earlier_curves"]) == 2
+    assert "only_encoder" not in made.card
+    assert '"only_encoder": true' in (tmp_path / "round-1" / "training.json").read_text()
+    assert len(made.card["success_before_rounds"]) == 2
+
+
+def test_looks_need_a_policy_to_begin_with():
+    with pytest.raises(ValueOutOfRangeError, match="looks is 2.*0 without a policy to begin with"):
+        PretrainConfig(looks=2)
 
 
 def test_broken_run_goes_on_without_driving_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

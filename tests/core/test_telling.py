@@ -121,6 +121,20 @@ def test_encoder_with_a_head_of_its_own_learns_on_at_once_and_in_the_same_scale(
     assert all(not torch.equal(a, b) for a, b in pairs)
 
 
+def test_denoiser_stays_when_only_the_encoder_learns(
+    seeing: Checkpoint, demonstrations: list[Trajectory]
+) -> None:
+    after = pretrain(TASK.name, demonstrations, _config(), start=seeing, only_encoder=True)
+    assert after.card["only_encoder"] and "held_out_curve" not in after.card
+    assert len(after.card["earlier_curves"]) == 1
+
+    def same(name: str) -> bool:
+        parts = [getattr(one.policy, name).state_dict().values() for one in (seeing, after)]
+        return all(torch.equal(a, b) for a, b in zip(*parts, strict=True))
+
+    assert same("denoiser") and not same("encoder")
+
+
 def test_what_is_told_must_be_what_the_task_hides() -> None:
     config = replace(_config(), images=replace(IMAGES, told=3))
     with pytest.raises(ValueOutOfRangeError, match=f"told is 3, but must be 0 or {HIDDEN}"):

@@ -42,12 +42,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="share of demonstrations in the preferred group, for avoid: on the left"
         " (default: the task's)",
     )
-    parser.add_argument(
-        "--updates",
-        type=int,
-        help="of a training from fresh weights; one that begins with another task's policy, as"
-        " with pictures, has the updates of a round (default: the preset's)",
-    )
+    parser.add_argument("--updates", type=int, help="from fresh weights (default: the preset's)")
     parser.add_argument(
         "--executed-steps", type=int, help="control steps between two decisions (default: preset's)"
     )
@@ -145,11 +140,11 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         checkpoint = load_checkpoint(shipped_checkpoint(config.begin_with))
     driven: list[Trajectory] = []
     on_the_way: list[float] = []  # success of the policies that experts took over from
-    for number in range(config.rounds + 1):
+    for number in range(config.looks + config.rounds + 1):
         if checkpoint is not None:
-            driven, recoveries = _take_over(args, config, checkpoint, number)
-            shown += recoveries
-            succeeded = sum(one.success for one in driven) / len(driven)
+            met, recoveries = _take_over(args, config, checkpoint, number)
+            driven, shown = driven + met, shown + recoveries
+            succeeded = sum(one.success for one in met) / len(met)
             bar.console.print(f"before round {number}: success {succeeded:.1%}")
             on_the_way += [succeeded] if number else []  # the policy begun with is another task's
         updates = config.updates if checkpoint is None else config.round_updates
@@ -160,6 +155,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             config,
             start=checkpoint,
             driven=driven,
+            only_encoder=number < config.looks,
             workspace=_round_folder(args, number),
             kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
