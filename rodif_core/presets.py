@@ -37,15 +37,15 @@ class PretrainConfig:
     weight_decay: float = 1e-6
     warm_up: int = 200
     ema_decay: float = 0.999
-    rounds: int = 0  # of training again, on what experts did after they took over
+    rounds: int = 0  # of training on, also on what experts did after they took over
     recoveries: int = 300  # takeovers tried a round
     drives: int = 1  # rollouts for each of them; from 2 on, failures and every group get as many
     round_updates: int = 8_000
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
     encoder: EncoderConfig = EncoderConfig()  # how their encoder is trained
-    begin_with: TaskName | None = None  # go on from the shipped policy of this task …
-    looks: int = 0  # … first with so many trainings of the encoder alone
+    begin_with: TaskName | None = None  # no first training: go on from this shipped policy, …
+    looks: int = 0  # … with so many trainings of the encoder alone before the rounds
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -60,6 +60,9 @@ class PretrainConfig:
         if self.looks < 0 or (self.looks and self.begin_with is None):
             legal = "at least 0, and 0 without a policy to begin with"
             raise ValueOutOfRangeError("looks", self.looks, legal)
+        if self.begin_with is not None and self.looks + self.rounds < 1:
+            legal = "at least 1, as there is no first training"
+            raise ValueOutOfRangeError("looks and rounds together", 0, legal)
         for name, value in (least | {"warm_up": 0, "weight_decay": 0}).items():
             if getattr(self, name) < value:
                 raise ValueOutOfRangeError(name, getattr(self, name), f"at least {value}")

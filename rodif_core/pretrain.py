@@ -181,7 +181,7 @@ def _split(
 def _deciding(config: PretrainConfig) -> dict[str, Any]:
     """What decides the result of one training; how many follow it does not, so that a finished
     series can have another round."""
-    following = ("rounds", "recoveries", "drives")
+    following = ("looks", "rounds", "recoveries", "drives")
     return {k: v for k, v in asdict(config).items() if k not in following}
 
 

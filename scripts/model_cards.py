@@ -108,8 +108,8 @@ def _data(card: dict[str, Any], shown: int) -> str:
         return (
             f"Begins with the shipped `{preset['begin_with']}`, whose state it sees from then on;"
             f" {shown:,} scripted demonstrations and what experts did after takeovers"
-            f" ({card['recoveries']} in all), {1 + rounds} rounds of"
-            f" {preset['round_updates']:,} updates of {rows}."
+            f" ({card['recoveries']} in all); {preset['looks']} trainings of the encoder alone,"
+            f" then {rounds} rounds of {preset['round_updates']:,} updates of {rows}."
         )
     data = f"{shown:,} scripted demonstrations, {preset['updates']:,} updates of {rows}"
     if rounds:
@@ -131,8 +131,9 @@ def _seen(checkpoint: Checkpoint) -> str:
         f" {config['moments'] + config.get('rearranged', 0):,} moments in {config['updates']:,}"
         f" updates of {config['batch_size']}"
     )
-    rounds, further = checkpoint.card["rounds"], config.get("round_updates", 0)
-    return told + (f", and in each round as many in {further:,}." if further and rounds else ".")
+    preset, further = checkpoint.card["preset"], config.get("round_updates", 0)
+    times = preset.get("looks", 0) + preset["rounds"] - (1 if preset.get("begin_with") else 0)
+    return told + (f", then {times} times as many in {further:,}." if further and times else ".")
 
 
 def _modes(checkpoint: Checkpoint) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from rich.progress import Progress
 
 from rodif_core import rollout as rollouts
@@ -23,7 +24,7 @@ from worker.cli import pretrain
 
 TASK, TOLD = TaskName.ALIGNING, TaskName.ALIGNING_STATE
 CONFIG = replace(
-    preset_for(TOLD, "cpu"), begin_with=TOLD, rounds=1, recoveries=3, round_updates=5,
+    preset_for(TOLD, "cpu"), begin_with=TOLD, rounds=2, recoveries=3, round_updates=5,
     images=ImageConfig(pixels=64, width=4, keypoints=4, told=14),
     encoder=EncoderConfig(moments=50, updates=3, round_updates=2, batch_size=8),
 )  # fmt: skip
@@ -50,21 +51,26 @@ def test_policy_that_was_told_the_state_is_begun_with(tmp_path: Path):
     assert begun in first and made.card["start"] not in first
 
 
-def test_first_looks_train_the_encoder_alone(tmp_path: Path):
-    made = trained(tmp_path, rounds=0, looks=2)
-    assert sorted(path.name for path in tmp_path.glob("round-*/pretrain.safetensors")) == []
-    folders = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("round"))
-    assert folders == ["round-0", "round-1", "round-2"]
-    # Encoder of two looks, and of the training that then moved the denoiser, too.
-    assert len(made.card["earlier_curves"]) == 2
-    assert "only_encoder" not in made.card
-    assert '"only_encoder": true' in (tmp_path / "round-1" / "training.json").read_text()
-    assert len(made.card["success_before_rounds"]) == 2
+def test_encoder_learns_alone_in_looks_and_the_denoiser_moves_in_rounds(tmp_path: Path):
+    begun = load_checkpoint(shipped_checkpoint(TOLD)).policy.denoiser.state_dict()
+    looked = trained(tmp_path, rounds=0, looks=2)
+    kept = looked.policy.denoiser.state_dict()
+    assert all(torch.equal(kept[name], value) for name, value in begun.items())
+    assert len(looked.card["earlier_curves"]) == 1
+    assert looked.card["only_encoder"] and looked.card["rounds"] == 0
+    # The same folder can have a round more: its looks are there already.
+    more = trained(tmp_path, rounds=1, looks=2)
+    moved = more.policy.denoiser.state_dict()
+    assert not any(torch.equal(moved[name], begun[name]) for name in begun if "weight" in name)
+    assert more.card["start"] == looked.digest
+    assert "only_encoder" not in more.card and len(more.card["success_before_rounds"]) == 2
 
 
 def test_looks_need_a_policy_to_begin_with():
     with pytest.raises(ValueOutOfRangeError, match="looks is 2.*0 without a policy to begin with"):
         PretrainConfig(looks=2)
+    with pytest.raises(ValueOutOfRangeError, match="looks and rounds together is 0.*at least 1"):
+        PretrainConfig(begin_with=TOLD)
 
 
 def test_broken_run_goes_on_without_driving_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -140,7 +140,8 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         checkpoint = load_checkpoint(shipped_checkpoint(config.begin_with))
     driven: list[Trajectory] = []
     on_the_way: list[float] = []  # success of the policies that experts took over from
-    for number in range(config.looks + config.rounds + 1):
+    first = 1 if checkpoint is None else 0  # a first training, which no rollouts precede
+    for number in range(first + config.looks + config.rounds):
         if checkpoint is not None:
             met, recoveries = _take_over(args, config, checkpoint, number)
             driven, shown = driven + met, shown + recoveries
