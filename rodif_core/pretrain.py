@@ -23,7 +23,7 @@ from rodif_core.diffusion.chain import add_noise
 from rodif_core.drift import fit_support, visited_states
 from rodif_core.encoded_rows import encode
 from rodif_core.encoder_training import train_encoder
-from rodif_core.errors import LearningError
+from rodif_core.errors import LearningError, ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint, SupportSet
 from rodif_core.policies.normaliser import Normaliser
 from rodif_core.policies.policy import DiffusionPolicy, PolicyConfig
@@ -100,19 +100,19 @@ def pretrain(
     start         go on from this policy, with its size and normaliser, for `config.round_updates`;
                   its encoder, if any, learns on for `config.encoder.round_updates`, also from what
                   was `driven`. Where pictures tell the state, may be the policy that is told it
-    only_encoder  the start's denoiser stays as it is; without a start there is none to stay
+    only_encoder  the denoiser of the start, which there must be, stays as it is
     kept_rows     folder for encoded pictures, which trainings with the same encoder may share
     precision     of the forward passes; by default mixed on a GPU
     track         rollouts of the policy after each of the first four fifths of the training; their
                   success goes to `progress` and to the card's rollout_curve, not into the weights
 
     Raises LearningError for fewer than two demonstrations, when the loss is not finite or the
-    workspace belongs to another training, and UnknownNameError for a device that is not there.
+    workspace belongs to another training, UnknownNameError for a device that is not there, and
+    ValueOutOfRangeError for `only_encoder` without a start.
     """
     check_device(device)
     precision = precision or usual_precision(device)
-    basis: dict[str, Any] = {"device": device, "precision": precision.value}
-    basis |= {"start": start and start.digest} | ({"only_encoder": True} if only_encoder else {})
+    basis = _basis(device, precision, start, only_encoder)
     if workspace is not None:
         _claim(workspace, task_name, demonstrations, basis | _deciding(config))
     task = get_task(task_name)
@@ -140,6 +140,16 @@ def pretrain(
         policy, seen, unseen, config, workspace, device, precision, success_of, progress
     )
     return Checkpoint(task_name, replace(policy, denoiser=average), support, card | curves)
+
+
+def _basis(
+    device: str, precision: Precision, start: Checkpoint | None, only_encoder: bool
+) -> dict[str, Any]:
+    """What decides a training beside its config and what was shown."""
+    if only_encoder and start is None:
+        raise ValueOutOfRangeError("only_encoder", True, "False without a start")
+    basis = {"device": device, "precision": precision.value, "start": start and start.digest}
+    return basis | ({"only_encoder": True} if only_encoder else {})
 
 
 def _facts(

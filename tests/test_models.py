@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -53,3 +53,16 @@ def test_a_shipped_policy_is_small_good_and_undecided(task: TaskName):
     assert measured["n"] >= (200 if task in ("aligning", "stacking") else 500)
     assert measured["success"] >= LEAST_SUCCESS[task]
     assert len(measured["modes"]) >= 2
+
+
+def test_card_of_a_policy_that_got_eyes_tells_what_it_began_with():
+    shipped = load_checkpoint(shipped_checkpoint(TaskName.ALIGNING))
+    preset = asdict(preset_for(TaskName.ALIGNING, "cpu"))
+    preset |= {"begin_with": "aligning-state", "looks": 3, "rounds": 1}
+    preset["encoder"] |= {"moments": 2_000, "rearranged": 500, "round_updates": 70}
+    told = {"preset": preset, "recoveries": 90, "rounds": 1, "demonstrations": 490}
+    card = model_cards._card(replace(shipped, card=shipped.card | told))
+    assert "Begins with the shipped `aligning-state`" in card
+    assert "400 scripted demonstrations and what experts did after takeovers (90 in all)" in card
+    assert "3 trainings of the encoder alone, then 1 rounds of 8,000 updates" in card
+    assert "saw 2,500 moments in 4,000 updates of 64, then 3 times as many in 70." in card

@@ -161,8 +161,7 @@ class DiffusionPolicy:
         """Observation rows of a policy with images, in task units, each frame encoded once.
 
         proprioception (B, T, P) in task units, frames uint8 RGB (B, T, C, H, W, 3) → (B, T, O).
-        Differentiable. Raises LearningError for a policy without
-        images.
+        Differentiable. Raises LearningError for a policy without images.
         """
         if self.encoder is None:
             raise LearningError("this policy has no image encoder: its config has no `images`")

@@ -135,6 +135,13 @@ def test_denoiser_stays_when_only_the_encoder_learns(
     assert same("denoiser") and not same("encoder")
 
 
+def test_training_the_encoder_alone_needs_a_denoiser_that_stays(
+    demonstrations: list[Trajectory],
+) -> None:
+    with pytest.raises(ValueOutOfRangeError, match="only_encoder is True.*False without a start"):
+        pretrain(TASK.name, demonstrations, _config(), only_encoder=True)
+
+
 def test_what_is_told_must_be_what_the_task_hides() -> None:
     config = replace(_config(), images=replace(IMAGES, told=3))
     with pytest.raises(ValueOutOfRangeError, match=f"told is 3, but must be 0 or {HIDDEN}"):

@@ -144,7 +144,9 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     for number in range(first + config.looks + config.rounds):
         if checkpoint is not None:
             met, recoveries = _take_over(args, config, checkpoint, number)
-            driven, shown = driven + met, shown + recoveries
+            shown += recoveries
+            # Only encoders learn from it, and thousands of rollouts take gigabytes.
+            driven += met if config.images is not None else []
             succeeded = sum(one.success for one in met) / len(met)
             bar.console.print(f"before round {number}: success {succeeded:.1%}")
             on_the_way += [succeeded] if number else []  # the policy begun with is another task's
