@@ -187,9 +187,14 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
         "rounds": 2,
     },
     ("stacking", "cpu"): {
-        "images": ImageConfig(),
-        "encoder": EncoderConfig(moments=24_000, updates=5_000),
-        "rounds": 4,
+        "images": ImageConfig(told=45),
+        "encoder": EncoderConfig(
+            moments=25_000, rearranged=25_000, updates=6_000, round_updates=2_500
+        ),
+        "begin_with": TaskName.STACKING_STATE,
+        "looks": 5,
+        "rounds": 0,
+        "recoveries": 200,
     },
     **{
         (task, "paper"): {
