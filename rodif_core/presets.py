@@ -181,9 +181,10 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
     ("sorting", "paper"): {"executed_steps": 4},
     ("aligning-state", "cpu"): {"updates": 30_000},
     ("aligning", "cpu"): {
-        "images": ImageConfig(),
-        "encoder": EncoderConfig(moments=24_000, updates=4_000),
-        "updates": 20_000,
+        "images": ImageConfig(told=14),
+        "encoder": EncoderConfig(moments=32_000, updates=5_000, round_updates=2_000),
+        "begin_with": TaskName.ALIGNING_STATE,
+        "looks": 3,
         "rounds": 2,
     },
     ("stacking", "cpu"): {

@@ -27,7 +27,7 @@ CPU_MINUTES = {
     "avoid": 10,
     "pushing": 33,
     "sorting": 140,
-    "aligning": 57,
+    "aligning": 90,
     "aligning-state": 9,
     "stacking": 130,
     "stacking-state": 75,

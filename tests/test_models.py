@@ -59,7 +59,12 @@ def test_card_of_a_policy_that_got_eyes_tells_what_it_began_with():
     shipped = load_checkpoint(shipped_checkpoint(TaskName.ALIGNING))
     preset = asdict(preset_for(TaskName.ALIGNING, "cpu"))
     preset |= {"begin_with": "aligning-state", "looks": 3, "rounds": 1}
-    preset["encoder"] |= {"moments": 2_000, "rearranged": 500, "round_updates": 70}
+    preset["encoder"] |= {
+        "moments": 2_000,
+        "rearranged": 500,
+        "updates": 4_000,
+        "round_updates": 70,
+    }
     told = {"preset": preset, "recoveries": 90, "rounds": 1, "demonstrations": 490}
     card = model_cards._card(replace(shipped, card=shipped.card | told))
     assert "Begins with the shipped `aligning-state`" in card
