@@ -193,7 +193,7 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
             moments=25_000, rearranged=25_000, updates=6_000, round_updates=2_500
         ),
         "begin_with": TaskName.STACKING_STATE,
-        "looks": 5,
+        "looks": 8,
         "rounds": 0,
         "recoveries": 200,
     },

@@ -29,7 +29,7 @@ CPU_MINUTES = {
     "sorting": 140,
     "aligning": 90,
     "aligning-state": 9,
-    "stacking": 130,
+    "stacking": 195,
     "stacking-state": 75,
 }
 
