@@ -70,7 +70,8 @@ class _Panel:
         self._still = Image.new("RGB", size, (255, 255, 255))
         draw = ImageDraw.Draw(self._still)
         draw_scene(draw, place, shapes)
-        draw.line(self._path, fill=pale(self._colour), width=DETAIL, joint="curve")
+        # Wide enough to be seen in the list, which shows the picture at half its size.
+        draw.line(self._path, fill=pale(self._colour), width=2 * DETAIL, joint="curve")
         draw.rectangle((0, 0, size[0], (HEADER - 2) * DETAIL), fill=self._colour)
         font = ImageFont.load_default(size=15 * DETAIL)
         centre = (size[0] / 2, (HEADER - 2) * DETAIL / 2)
