@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rodif_core.errors import UnknownNameError, ValueOutOfRangeError
 from rodif_core.json_config import JsonConfig
@@ -186,6 +186,25 @@ class FinetuneConfig(JsonConfig):
         for name in ("updates", "chunk_rows", "group_size"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         _require(0 <= self.seed <= LARGEST_SEED, "seed", self.seed, f"0 … {LARGEST_SEED}")
+
+
+# Where a task's rounds differ from the defaults. In Stacking many failures come of the policy's own
+# noise: its policies learn from rollouts with half as much, and from more of them.
+_STEADIER = {"guide": {"self_training_noise": 0.5, "self_training_rollouts": 400}}
+TASK_SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    TaskName.STACKING: _STEADIER,
+    TaskName.STACKING_STATE: _STEADIER,
+}
+
+
+def settings_for_task(task: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """`settings` of a FinetuneConfig, with the task's own where they say nothing."""
+    usual = TASK_SETTINGS.get(task, {})
+    filled = {**usual, **settings}
+    guide = filled.get("guide")
+    if isinstance(guide, Mapping):
+        filled["guide"] = {**usual.get("guide", {}), **guide}
+    return filled
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from rodif_core.spec import EVALUATION_SEED, FinetuneConfig
+from rodif_core.spec import EVALUATION_SEED, FinetuneConfig, settings_for_task
 from server.errors import ConflictError, NotFoundError
 from server.snapshots import new_labels_since_round, snapshot_to_learn_from
 from server.states import (
@@ -62,7 +62,7 @@ RETRY_AFTER = timedelta(minutes=10)
 class RoundRequest:
     """What a client or the tick asks for; None means the campaign's setting."""
 
-    config: dict[str, Any] | None = None  # partial FinetuneConfig
+    config: dict[str, Any] | None = None  # partial FinetuneConfig; the task's own settings fill it
     publish_rule: PublishRule | None = None
     evaluation: dict[str, int] | None = None  # {"episodes": n, "seed": s}, each optional
     snapshot_digest: str | None = None  # reuse a frozen snapshot
@@ -89,7 +89,7 @@ def launch(
         raise ConflictError(f"campaign {campaign_id} is archived")
     settings = campaign.settings
     publish_rule = PublishRule(request.publish_rule or settings["publish_rule"])
-    config = _config(request, method=settings["method"])
+    config = _config(request, campaign.task, method=settings["method"])
     if publish_rule != PublishRule.NEVER:
         _refuse_second_publishing_round(session, campaign_id)
     snapshot = snapshot_to_learn_from(session, now, campaign_id, request.snapshot_digest)
@@ -142,11 +142,11 @@ def _queue(session: Session, now: datetime, new_round: Round) -> None:
     )
 
 
-def _config(request: RoundRequest, *, method: str) -> FinetuneConfig:
+def _config(request: RoundRequest, task: str, *, method: str) -> FinetuneConfig:
     partial = dict(request.config or {})
     if request.seed is not None:
         partial["seed"] = request.seed
-    return FinetuneConfig.from_json({"method": method, **partial})
+    return FinetuneConfig.from_json({"method": method, **settings_for_task(task, partial)})
 
 
 def _refuse_second_publishing_round(session: Session, campaign_id: int) -> None:

@@ -109,7 +109,9 @@ def test_settings_that_the_fine_tuner_lacks_are_named_before_anything_starts(
     assert not (tmp_path / "state").exists()
 
 
-def test_usual_sizes_grow_with_the_groups_and_measure_long_tasks_on_fewer_rollouts() -> None:
+def test_usual_sizes_grow_with_the_groups_and_measure_the_longest_tasks_on_fewer_rollouts() -> None:
     assert DemoConfig.for_task(get_task(TaskName.AVOID)) == DemoConfig()
     stacking = DemoConfig.for_task(get_task(TaskName.STACKING_STATE))
     assert (stacking.pairs, stacking.evaluation_episodes) == (300, 200)
+    sorting = DemoConfig.for_task(get_task(TaskName.SORTING))
+    assert (sorting.evaluation_episodes, sorting.comparison_updates) == (400, 4)

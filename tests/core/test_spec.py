@@ -14,11 +14,13 @@ from rodif_core.spec import (
     SEEDS_PER_ROUND,
     SEEDS_PER_USE,
     SELECTION_SEED,
+    TASK_SETTINGS,
     FinetuneConfig,
     GuideConfig,
     RolloutConfig,
     TaskName,
     parse_name,
+    settings_for_task,
 )
 
 
@@ -135,3 +137,23 @@ def test_to_json_gives_plain_types_at_every_depth() -> None:
     assert json.loads(json.dumps(data)) == data
     assert type(data["guide"]["scales"]) is list
     assert type(data["guide"]["scorer"]) is str
+
+
+@pytest.mark.parametrize("task", TASK_SETTINGS)
+def test_a_tasks_own_settings_are_legal_and_differ_from_the_defaults(task: str) -> None:
+    config = FinetuneConfig.from_json(settings_for_task(TaskName(task), {}))
+    assert config != FinetuneConfig()
+
+
+def test_a_tasks_own_settings_fill_only_what_was_not_given() -> None:
+    given = {"updates": 3, "guide": {"self_training_noise": 1.0}}
+    filled = FinetuneConfig.from_json(settings_for_task(TaskName.STACKING, given))
+    assert filled.updates == 3
+    assert (filled.guide.self_training_noise, filled.guide.self_training_rollouts) == (1.0, 400)
+    assert settings_for_task(TaskName.AVOID, given) == given
+    assert given == {"updates": 3, "guide": {"self_training_noise": 1.0}}
+
+
+def test_a_guide_that_is_no_object_is_refused_whatever_the_task() -> None:
+    with pytest.raises(ValueOutOfRangeError, match="guide is 7"):
+        FinetuneConfig.from_json(settings_for_task(TaskName.STACKING, {"guide": 7}))

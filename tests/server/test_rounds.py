@@ -25,7 +25,7 @@ from server.states import (
 from server.store import jobs
 from server.store.labels import snapshot_labels
 from server.store.session import Database
-from server.store.tables import Event, Job, Label, LabelSnapshot, Pair, Round
+from server.store.tables import Campaign, Event, Job, Label, LabelSnapshot, Pair, Round
 from tests import factories
 from tests.factories import NOW, PUBLISHED_PATH
 from tests.server.threads import at_once
@@ -64,6 +64,16 @@ def test_a_launched_round_is_frozen_queued_and_can_be_followed(world: World) -> 
     assert world.sent == [(job.id, JobKind.FINETUNE)]
     assert world.client("ada").get(f"/rounds/{found['id']}").json() == found
     assert world.client("ada").get(f"/campaigns/{campaign_id}/rounds").json()["items"] == [found]
+
+
+def test_a_round_has_its_tasks_own_settings_where_none_are_given(sqlite_world: World) -> None:
+    campaign_id = _labelled(sqlite_world)
+    with sqlite_world.database.write() as session:
+        session.get_one(Campaign, campaign_id).task = "stacking"
+    given = {"guide": {"self_training_rollouts": 50}}
+    guide = _launch(sqlite_world, campaign_id, config=given).json()["config"]["guide"]
+    assert (guide["self_training_rollouts"], guide["self_training_noise"]) == (50, 0.5)
+    assert guide["scales"] == [1.0, 2.0]
 
 
 def test_a_snapshot_holds_the_last_word_of_each_annotator_on_each_pair(database: Database) -> None:

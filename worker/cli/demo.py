@@ -96,7 +96,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ("pairs", "pairs to choose among them; more for tasks of many groups"),
         ("labels", "preferences to give; pairs that look alike are answered 'equal' besides"),
         ("annotators", "simulated annotators"),
-        ("evaluation-episodes", "rollouts of each evaluation; 200 on long tasks"),
+        ("evaluation-episodes", "rollouts of each evaluation; Stacking: 200"),
         ("comparison-updates", "full-batch updates of literal RoDiF and DP-DPO; 4 on long tasks"),
         ("seed", "of the rollouts and the flips"),
     ):

@@ -37,7 +37,7 @@ Say = Callable[[str], None]
 # With more groups, fewer of the pairs have a rollout of the wanted one: so many more for each group
 # beyond Avoid's two let about as many pairs be judged.
 PAIRS_PER_GROUP = 30
-LONG_TASK = 200  # control steps
+LONG_TASK, VERY_LONG_TASK = 200, 500  # control steps
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,13 @@ class DemoConfig:
     @classmethod
     def for_task(cls, task: Task) -> DemoConfig:
         """Usual sizes for a task: more pairs where there are many groups; where rollouts take long,
-        fewer to measure and fewer updates of the literal methods."""
+        fewer updates of the literal methods, and where they take longest, fewer to measure."""
         usual = cls(pairs=cls.pairs + PAIRS_PER_GROUP * (len(task.groups) - 2))
-        if task.max_steps <= LONG_TASK:
-            return usual
-        return replace(usual, evaluation_episodes=200, comparison_updates=4)
+        if task.max_steps > LONG_TASK:
+            usual = replace(usual, comparison_updates=4)
+        if task.max_steps > VERY_LONG_TASK:
+            usual = replace(usual, evaluation_episodes=200)
+        return usual
 
 
 @dataclass
