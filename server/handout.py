@@ -212,6 +212,7 @@ def _open_for(
         campaign.id,
         annotator_id,
         labels_per_pair=int(campaign.settings["labels_per_pair"]),
+        published_checkpoint_id=campaign.published_checkpoint_id,
         telling_first=handed_out is not None and handed_out % IN_TURN != 0,
     )
     return pairs.where(_not_given_back(now, annotator_id))

@@ -37,15 +37,17 @@ def open_pairs(
     annotator_id: int,
     *,
     labels_per_pair: int,
+    published_checkpoint_id: int,
     telling_first: bool = False,
 ) -> Select[Pair, int]:
     """Ready pairs with room for one more label, which this annotator has neither done nor got.
 
     Beside each stands how many labels in force and live leases it has.
 
-    Those with most room come first, then the oldest, or with `telling_first` those of which the
-    labels so far say that people will prefer one side. Sets instead of a look-up per pair: with
-    thousands of pairs that is many times faster on both engines.
+    Those of the published policy come first: what its predecessors did matters less. Among them
+    those with most room, then the oldest, or with `telling_first` those of which the labels so far
+    say that people will prefer one side. Sets instead of a look-up per pair: with thousands of
+    pairs that is many times faster on both engines.
     """
     mine = select(Label.pair_id).where(
         Label.campaign_id == campaign_id, Label.annotator_id == annotator_id, is_effective()
@@ -53,6 +55,9 @@ def open_pairs(
     leases = select(Lease.pair_id).where(_is_live(now))
     labelled = _labels_by_pair(campaign_id)
     held = leases.add_columns(func.count().label("count")).group_by(Lease.pair_id).subquery()
+    published = select(Episode.id).where(
+        Episode.campaign_id == campaign_id, Episode.checkpoint_id == published_checkpoint_id
+    )
     # All that is taken is taken by others, because the annotator's own pairs are left out.
     count = func.coalesce(labelled.c.total, 0) + func.coalesce(held.c["count"], 0)
     query = (
@@ -66,7 +71,7 @@ def open_pairs(
             Pair.id.not_in(leases.where(Lease.annotator_id == annotator_id)),
             count < labels_per_pair,
         )
-        .order_by(count)
+        .order_by(case((Pair.first_episode_id.in_(published), 0), else_=1), count)
     )
     if telling_first:
         kinds = _with_kinds(query)

@@ -110,6 +110,25 @@ def test_prefetching_at_the_end_finds_nothing_but_a_reload_still_shows_the_last_
     assert _next(world, "ann", campaign_id, hold=2)["lease_id"] == last["lease_id"]
 
 
+def test_pairs_of_the_published_policy_come_before_those_of_its_predecessors(world: World) -> None:
+    campaign_id, old = world.add_campaign(pairs=6)
+    with world.database.write() as session:
+        campaign = session.get_one(factories.Campaign, campaign_id)
+        campaign.published_checkpoint_id = factories.add_checkpoint(session, "avoid-round-1").id
+        new = [pair.id for pair in factories.add_pairs(session, campaign, 6)]
+        for pair_id in new:
+            pair = session.get_one(Pair, pair_id)
+            for episode_id in (pair.first_episode_id, pair.second_episode_id):
+                episode = session.get_one(Episode, episode_id)
+                episode.checkpoint_id = campaign.published_checkpoint_id
+    got = []
+    for _ in range(8):  # both of the turns that look for what tells most and of those in turn
+        handed = _next(world, "ann", campaign_id)
+        _label(world, "ann", handed, "equal")
+        got.append(handed["pair"]["id"])
+    assert got == new + old[:2]
+
+
 def test_reasons_when_there_is_nothing_to_label(world: World) -> None:
     campaign_id, _ = world.add_campaign()
     assert _nothing(world, "ann", campaign_id) == "no_pairs"
