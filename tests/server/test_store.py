@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import select, text
 from sqlalchemy.exc import DatabaseError, StatementError
 
 from server.errors import ArtifactError
@@ -23,6 +23,13 @@ from server.store.tables import Annotator, Job
 from tests import factories
 from tests.factories import NOW
 from tests.server.threads import at_once
+
+
+def test_a_commit_on_sqlite_reaches_the_disk_before_it_is_acknowledged(tmp_path: Path) -> None:
+    database = Database(f"sqlite:///{tmp_path / 'studio.db'}")
+    with database.write() as session:
+        assert session.execute(text("PRAGMA synchronous")).scalar_one() == 2  # FULL
+    database.dispose()
 
 
 def _enqueue(database: Database, campaign_id: int, *, fail: bool = False) -> None:
