@@ -187,8 +187,11 @@ def _median_distances(points: Array) -> Array:
 
 
 def _kernel(a: PathFeatures, b: PathFeatures, scales: Array) -> Array:
-    squared = ((a.points[:, None] - b.points[None]) ** 2).sum(-1)
-    alike = np.exp(-0.5 * squared / scales**2).mean(-1)
+    """(R, R') covariance; point by point, as all at once would take gigabytes at R = 1,000."""
+    alike = np.zeros((len(a.points), len(b.points)))
+    for place, scale in enumerate(scales):
+        squared = ((a.points[:, None, place] - b.points[None, :, place]) ** 2).sum(-1)
+        alike += np.exp(-0.5 * squared / scale**2)
     same_outcome = a.success[:, None] == b.success[None]
-    result: Array = PRIOR_SD**2 * same_outcome * (alike + OUTCOME_VARIANCE)
+    result: Array = PRIOR_SD**2 * same_outcome * (alike / len(scales) + OUTCOME_VARIANCE)
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -223,6 +224,16 @@ def test_path_utility_recovers_the_side_from_sparse_noisy_labels() -> None:
     utilities = PathUtility.fit(PathFeatures.of(trajectories, AVOID), preferences).utilities
     above = utilities > split_threshold(utilities)
     assert (above == np.array([x < 0.5 for x in sides])).mean() > 0.9
+
+
+def test_the_memory_of_path_utilities_does_not_grow_with_the_points() -> None:
+    rng = np.random.default_rng(0)
+    features = PathFeatures(rng.normal(size=(300, 64, 3)), np.ones(300, dtype=bool))
+    tracemalloc.start()
+    PathUtility.fit(features, [Preference(0, 1)])
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 20 * 300 * 300 * 8  # a score of matrices (R, R) of doubles; at once it takes 384
 
 
 def test_path_features_are_evenly_spaced_along_the_path() -> None:
