@@ -82,6 +82,25 @@ def test_interrupted_collect_ends_with_the_same_files_as_an_undisturbed_one(
     assert essence(calm) == essence(stormy)
 
 
+def test_collect_interrupted_between_its_pairs_stores_each_of_them_once(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs come in portions, so that annotators' answers never wait for thousands of them."""
+    monkeypatch.setattr(collect, "PAIR_BATCH", 2)
+    job_id = world.enqueue_collect(episodes=5, pairs=7)
+    with monkeypatch.context() as patch:
+        patch.setattr(collect, "_add_pairs", failing_once(collect._add_pairs, 2))
+        assert run_job(world.bench, job_id) == JobState.QUEUED
+    assert len(world.rows(Pair)) == 4
+    assert run_job(world.bench, job_id) == JobState.DONE
+    ends = {frozenset((p.first_episode_id, p.second_episode_id)) for p in world.rows(Pair)}
+    assert len(ends) == len(world.rows(Pair)) == 7
+    replays = [job.pair_id for job in world.rows(Job) if job.kind == JobKind.REPLAY]
+    assert sorted(replays) == [pair.id for pair in world.rows(Pair)]
+    result = world.job_of(JobKind.COLLECT).result
+    assert result is not None and result["pairs"] == 7
+
+
 def test_collect_fails_with_the_legal_range_when_more_pairs_are_asked_than_exist(
     world: World,
 ) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from server.store.tables import Checkpoint, Episode, Pair
 from worker.attempt import Attempt
 
 BATCH = 20  # episodes per transaction: what at most is lost when the worker dies
+PAIR_BATCH = 200  # pairs per transaction, a third of a second of SQLite's only writer
 PAIR_STREAM, SIDE_STREAM = 2, 3  # random streams of a job beside those of its rollouts
 
 
@@ -66,15 +68,24 @@ def run(attempt: Attempt) -> None:
             _store(attempt, plan, policy, seeds, stored)
             stored.update(seeds)
             attempt.progress("rollouts", len(stored) / plan.episodes)
-    with attempt.step() as session:
+    with attempt.bench.database.read() as session:
         episodes = _episodes(session, attempt, plan)
-        pairs = _add_pairs(session, attempt, plan, episodes)
-        groups = Counter(episode.group or "none" for episode in episodes)
+        known = _known_pairs(session, attempt.facts.campaign_id)
+    chosen = _choose_pairs(attempt, plan, episodes)
+    # What earlier attempts at this job have stored is the job's own.
+    own = [pair for pair in chosen if not _is_older(known.get(_ends(pair)), attempt)]
+    missing = [pair for pair in own if _ends(pair) not in known]
+    for first in range(0, len(missing), PAIR_BATCH):
+        with attempt.step() as session:
+            _add_pairs(session, attempt, missing[first : first + PAIR_BATCH])
+        attempt.progress("pairs", min(1.0, (first + PAIR_BATCH) / len(missing)))
+    groups = Counter(episode.group or "none" for episode in episodes)
+    with attempt.step() as session:
         attempt.finish(
             session,
             {
                 "episodes": len(episodes),
-                "pairs": pairs,
+                "pairs": len(own),
                 "groups": dict(sorted(groups.items())),
                 "seconds": attempt.seconds(),
             },
@@ -130,10 +141,8 @@ def _episodes(session: Session, attempt: Attempt, plan: CollectPlan) -> Sequence
     ).all()
 
 
-def _add_pairs(
-    session: Session, attempt: Attempt, plan: CollectPlan, episodes: Sequence[Episode]
-) -> int:
-    """Store the chosen pairs with one replay job each; returns how many are new."""
+def _choose_pairs(attempt: Attempt, plan: CollectPlan, episodes: Sequence[Episode]) -> list[Pair]:
+    """The job's pairs in their order, not stored yet; every attempt chooses the same ones."""
     chosen = choose_pairs(
         [episode.group for episode in episodes],
         count=plan.pairs,
@@ -142,9 +151,8 @@ def _add_pairs(
         rng=np.random.default_rng([plan.seed, PAIR_STREAM]),
     )
     sides = np.random.default_rng([plan.seed, SIDE_STREAM]).random(len(chosen)) < 0.5
-    known = _known_pairs(session, attempt.facts.campaign_id)
     now = attempt.bench.clock()
-    pairs = [
+    return [
         Pair(
             campaign_id=attempt.facts.campaign_id,
             first_episode_id=episodes[item.first].id,
@@ -155,26 +163,35 @@ def _add_pairs(
             created_at=now,
         )
         for item, left in zip(chosen, sides, strict=True)
-        if frozenset((episodes[item.first].id, episodes[item.second].id)) not in known
     ]
+
+
+def _add_pairs(session: Session, attempt: Attempt, pairs: Sequence[Pair]) -> None:
+    """Store pairs with one replay job each."""
     session.add_all(pairs)
     session.flush()
     for pair in pairs:
         jobs.enqueue(
             session,
-            now,
+            attempt.bench.clock(),
             kind=JobKind.REPLAY,
             campaign_id=attempt.facts.campaign_id,
             payload={},
             pair_id=pair.id,
             dedupe_key=f"replay:{pair.id}",
         )
-    return len(pairs)
 
 
-def _known_pairs(session: Session, campaign_id: int) -> set[frozenset[int]]:
-    """Episode ids of all pairs of the campaign, in either order."""
-    rows = session.execute(
-        select(Pair.first_episode_id, Pair.second_episode_id).where(Pair.campaign_id == campaign_id)
-    )
-    return {frozenset((first, second)) for first, second in rows}
+def _ends(pair: Pair) -> frozenset[int]:
+    return frozenset((pair.first_episode_id, pair.second_episode_id))
+
+
+def _is_older(stored_at: datetime | None, attempt: Attempt) -> bool:
+    return stored_at is not None and stored_at < attempt.facts.started_at
+
+
+def _known_pairs(session: Session, campaign_id: int) -> dict[frozenset[int], datetime]:
+    """Episode ids of all pairs of the campaign, in either order, and when they were stored."""
+    columns = (Pair.first_episode_id, Pair.second_episode_id, Pair.created_at)
+    rows = session.execute(select(*columns).where(Pair.campaign_id == campaign_id))
+    return {frozenset((first, second)): stored_at for first, second, stored_at in rows}
