@@ -16,7 +16,9 @@ from server.store import jobs
 from server.store.tables import Checkpoint, Job, Round
 from worker.attempt import Attempt
 
-BATCH = 50  # episodes stepped together: progress shows after each; the result is the same
+# Episodes stepped together: progress shows after each portion. `rodif evaluate` steps more together,
+# so that its paths differ in their last digits, and now and then an episode ends otherwise.
+BATCH = 50
 
 
 def run(attempt: Attempt) -> None:
