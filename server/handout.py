@@ -49,6 +49,7 @@ class Handout:
     pair: Pair
     criterion: str
     duration_s: float | None  # of the longer episode
+    step_s: float | None  # of one control step, which is one frame of the replay
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ def handout(session: Session, campaign: Campaign, lease: Lease) -> Handout:
     """The lease with what its page shows."""
     session.flush()
     pair = session.get_one(Pair, lease.pair_id)
-    return Handout(lease, pair, campaign.criterion, _duration(session, pair))
+    return Handout(lease, pair, campaign.criterion, *_duration_and_step(session, pair))
 
 
 def progress(session: Session, now: datetime, campaign_id: int, annotator_id: int) -> Progress:
@@ -259,16 +260,17 @@ def progress(session: Session, now: datetime, campaign_id: int, annotator_id: in
     return Progress(done=session.execute(mine).scalar_one(), remaining=counted + held)
 
 
-def _duration(session: Session, pair: Pair) -> float | None:
-    """Seconds of the longer episode; None when the checkpoint does not tell its control step."""
-    seconds: float | None = None
-    for episode_id in (pair.first_episode_id, pair.second_episode_id):
-        episode = session.get_one(Episode, episode_id)
-        checkpoint = session.get_one(Checkpoint, episode.checkpoint_id)
-        control_dt = checkpoint.config.get("task_facts", {}).get("control_dt")
-        if control_dt is not None:
-            seconds = max(seconds or 0.0, episode.steps * float(control_dt))
-    return seconds
+def _duration_and_step(session: Session, pair: Pair) -> tuple[float | None, float | None]:
+    """Seconds of the longer episode and of one control step; None when the checkpoint does not
+    tell its control step. Both episodes are of the campaign's task."""
+    episodes = [
+        session.get_one(Episode, i) for i in (pair.first_episode_id, pair.second_episode_id)
+    ]
+    checkpoint = session.get_one(Checkpoint, episodes[0].checkpoint_id)
+    control_dt = checkpoint.config.get("task_facts", {}).get("control_dt")
+    if control_dt is None:
+        return None, None
+    return max(episode.steps for episode in episodes) * float(control_dt), float(control_dt)
 
 
 def _why_nothing(session: Session, campaign_id: int) -> NothingReason:

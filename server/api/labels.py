@@ -64,6 +64,7 @@ def _next_out(session: Session, now: datetime, found: Handout) -> NextOut:
             replay_url=_replay_url(found.pair) or "",
             thumbnail_url=_thumbnail_url(found.pair),
             duration_s=found.duration_s,
+            step_s=found.step_s,
         ),
         criterion=found.criterion,
         progress=Progress.model_validate(far),

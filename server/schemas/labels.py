@@ -42,6 +42,7 @@ class LeasedPair(Out):
     left_label: Literal["A"] = "A"
     right_label: Literal["B"] = "B"
     duration_s: float | None
+    step_s: float | None  # of one control step, which is one frame of the replay
 
 
 class Progress(Out):

@@ -66,7 +66,7 @@ def test_annotators_are_told_of_no_policy_and_no_preferred_behaviour(sqlite_worl
     assert ann.get("/tasks").status_code == 403
     pair = ann.post(f"/campaigns/{campaign_id}/next", json={}).json()["pair"]
     assert set(pair) == {
-        *("id", "replay_url", "thumbnail_url", "left_label", "right_label", "duration_s")
+        *("id", "replay_url", "thumbnail_url", "left_label", "right_label", "duration_s", "step_s")
     }
 
 

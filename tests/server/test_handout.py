@@ -65,6 +65,7 @@ def test_a_handed_out_pair_shows_nothing_but_the_pair(world: World) -> None:
             "left_label": "A",
             "right_label": "B",
             "duration_s": pytest.approx(81 * 0.035),
+            "step_s": 0.035,
         },
         "criterion": factories.TASK_FACTS["criterion"],
         "progress": {"done": 0, "remaining": 2},

@@ -31,7 +31,8 @@ let turn = 0; // counts what is put on stage, so that a late answer does not pus
 
 function prepare(handout, active) {
   if (!has3d || !handout.pair.replay_url) return { handout, player: null };
-  return { handout, player: new Player(stage, handout.pair.replay_url, { view: transport.view, active }) };
+  const how = { view: transport.view, active, stepS: handout.pair.step_s };
+  return { handout, player: new Player(stage, handout.pair.replay_url, how) };
 }
 
 // ---- showing a pair --------------------------------------------------------------------------

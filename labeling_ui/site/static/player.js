@@ -8,11 +8,12 @@ import { PAGE_KEYS } from "./keys.js";
 
 const READY_TIMEOUT_MS = 45_000; // software rendering on a busy machine takes seconds
 export const SPEEDS = [0.5, 1, 2, 4];
-export const FRAME_S = 0.035; // one control step of the tasks
+const USUAL_STEP_S = 0.035; // a control step of most tasks, for a pair that tells none
 
 export class Player extends EventTarget {
-  constructor(holder, replayUrl, { view = "front", active = true } = {}) {
+  constructor(holder, replayUrl, { view = "front", active = true, stepS = null } = {}) {
     super();
+    this.stepS = stepS ?? USUAL_STEP_S; // seconds of one control step
     this.holder = holder;
     this.replayUrl = replayUrl;
     this.view = view;

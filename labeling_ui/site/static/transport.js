@@ -1,7 +1,7 @@
 // The transport bar and the camera buttons: they show and drive whichever player is on stage.
 
 import { find, findAll } from "./dom.js";
-import { FRAME_S, SPEEDS } from "./player.js";
+import { SPEEDS } from "./player.js";
 
 export class Transport {
   constructor() {
@@ -63,7 +63,7 @@ export class Transport {
 
   toggle() { this.send("toggle"); }
   restart() { this.send("restart"); }
-  step(direction) { this.send("step", direction * FRAME_S, { frames: direction }); }
+  step(direction) { this.send("step", direction * (this.player?.stepS ?? 0), { frames: direction }); }
   seek(seconds) { this.send("seek", seconds, { to: seconds }); }
   setSpeed(factor) { this.send("speed", factor, { factor }); }
 
