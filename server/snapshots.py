@@ -17,6 +17,7 @@ from server.store.labels import (
     effective_label_ids,
     has_decisive_label,
     snapshot_is_decisive,
+    telling_label_ids,
 )
 from server.store.tables import LabelSnapshot, Round
 
@@ -75,15 +76,17 @@ def _undecided(campaign_id: int, labels: int) -> ConflictError:
 
 
 def new_labels_since_round(session: Session, campaign_id: int) -> int:
-    """Labels in force that no publishing round has learned from.
+    """Labels in force that say something and that no publishing round has learned from.
 
+    Nothing can be learned from "cannot tell", so it neither is new nor makes a round due.
     What a round learned is lost when it fails or is cancelled: its labels are new again.
     """
+    telling = telling_label_ids(session, campaign_id)
     digest = _newest_learned(session, campaign_id)
     if digest is None:
-        return count_effective(session, campaign_id)
+        return len(telling)
     used = set(session.get_one(LabelSnapshot, digest).label_ids)
-    return sum(label_id not in used for label_id in effective_label_ids(session, campaign_id))
+    return sum(label_id not in used for label_id in telling)
 
 
 def _newest_learned(session: Session, campaign_id: int) -> str | None:

@@ -29,7 +29,8 @@ class Choice(StrEnum):
     CANNOT_TELL = "cannot_tell"
 
 
-DECISIVE = (Choice.FIRST, Choice.SECOND)  # choices that fine-tuning learns from
+DECISIVE = (Choice.FIRST, Choice.SECOND)  # choices that say which episode is better
+TELLING = (*DECISIVE, Choice.EQUAL)  # choices that a round learns from
 
 
 class PairState(StrEnum):

@@ -214,6 +214,26 @@ def test_labels_that_say_nothing_start_no_round(database: Database) -> None:
         assert session.scalars(select(LabelSnapshot)).all() == []
 
 
+@pytest.mark.parametrize(
+    ("choice", "due"),
+    [
+        (Choice.SECOND, RoundTrigger.LABELS),
+        (Choice.EQUAL, RoundTrigger.LABELS),
+        (Choice.CANNOT_TELL, None),
+    ],
+)
+def test_labels_from_which_nothing_is_learned_are_not_new(
+    database: Database, choice: Choice, due: RoundTrigger | None
+) -> None:
+    campaign_id = _campaign(database, round_after_labels=3)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+        third = session.scalars(select(Pair).order_by(Pair.id)).all()[2]
+        factories.add_label(session, third, 1, choice)
+    assert _new_labels(database, campaign_id) == (2 if due is None else 3)
+    assert _due(database, campaign_id) is due
+
+
 def test_two_ticks_at_once_start_one_round(database: Database) -> None:
     campaign_id = _campaign(database, round_after_labels=1)
     with database.write() as session:
