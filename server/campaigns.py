@@ -211,7 +211,7 @@ def _next_seed(session: Session, campaign: Campaign) -> int:
 
 def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
     """Figures of the campaign, as `StatsOut` shows them; raises NotFoundError."""
-    get_campaign(session, campaign_id)
+    campaign = get_campaign(session, campaign_id)
     pairs = count_by_state(session, campaign_id)
     answers = _answers(session, campaign_id)
     episodes = select(func.count()).where(Episode.campaign_id == campaign_id)
@@ -228,7 +228,7 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
             ),
             "reported": count_reported(session, campaign_id),
         },
-        "labels": _label_counts(session, campaign_id, answers),
+        "labels": _label_counts(session, campaign, answers),
         "annotators": _annotator_counts(session, campaign_id, answers),
         "jobs": _job_counts(session, campaign_id),
         "rollback_checkpoint_id": rollback_target(session, campaign_id),
@@ -257,8 +257,8 @@ def _answers(session: Session, campaign_id: int) -> list[_Answers]:
     return [_Answers(*row) for row in session.execute(query)]
 
 
-def _label_counts(session: Session, campaign_id: int, answers: list[_Answers]) -> dict[str, Any]:
-    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign_id))
+def _label_counts(session: Session, campaign: Campaign, answers: list[_Answers]) -> dict[str, Any]:
+    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign.id))
     found: Counter[str] = Counter()
     for answer in answers:
         found[answer.choice] += answer.count
@@ -267,7 +267,7 @@ def _label_counts(session: Session, campaign_id: int, answers: list[_Answers]) -
         "total": total,
         "effective": sum(by_choice.values()),
         "by_choice": by_choice,
-        "new_since_round": new_labels_since_round(session, campaign_id),
+        "new_since_round": new_labels_since_round(session, campaign),
     }
 
 

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from rodif_core.spec import EVALUATION_SEED, FinetuneConfig, settings_for_task
 from server.errors import ConflictError, NotFoundError
-from server.snapshots import new_labels_since_round, snapshot_to_learn_from
+from server.snapshots import may_learn, new_labels_since_round, snapshot_to_learn_from
 from server.states import (
     JobKind,
     JobState,
@@ -150,20 +150,17 @@ def _config(request: RoundRequest, task: str, *, method: str) -> FinetuneConfig:
 
 
 def _refuse_second_publishing_round(session: Session, campaign_id: int) -> None:
-    running = session.scalars(_publishing(campaign_id).limit(1)).one_or_none()
+    publishing = select(Round).where(
+        Round.campaign_id == campaign_id,
+        Round.publish_rule != PublishRule.NEVER,
+        Round.state.not_in(FINAL_STATES),
+    )
+    running = session.scalars(publishing.limit(1)).one_or_none()
     if running is not None:
         raise ConflictError(
             f"round {running.id} of campaign {campaign_id} is {running.state!r} and may publish;"
             " wait for it, cancel it, or start a comparison round with publish_rule 'never'"
         )
-
-
-def _publishing(campaign_id: int) -> Any:
-    return select(Round).where(
-        Round.campaign_id == campaign_id,
-        Round.publish_rule != PublishRule.NEVER,
-        Round.state.not_in(FINAL_STATES),
-    )
 
 
 def move(
@@ -251,18 +248,15 @@ def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger 
     every_minutes = float(campaign.settings["round_every_minutes"])
     if campaign.archived or (every_labels == 0 and every_minutes == 0):
         return None
-    if session.scalars(_publishing(campaign.id).limit(1)).first() is not None:
+    running = select(Round.id).where(may_learn(campaign), Round.state.not_in(FINAL_STATES))
+    if session.scalar(running.limit(1)) is not None:
         return None
     if now < _rest_ends(session, campaign) or not has_decisive_label(session, campaign.id):
         return None
-    new_labels = new_labels_since_round(session, campaign.id)
+    new_labels = new_labels_since_round(session, campaign)
     if every_labels > 0 and new_labels >= every_labels:
         return RoundTrigger.LABELS
-    last_start = session.scalar(
-        select(func.max(Round.created_at)).where(
-            Round.campaign_id == campaign.id, Round.publish_rule != PublishRule.NEVER
-        )
-    )
+    last_start = session.scalar(select(func.max(Round.created_at)).where(may_learn(campaign)))
     waited = now - (last_start or campaign.created_at)
     if every_minutes > 0 and new_labels > 0 and waited >= timedelta(minutes=every_minutes):
         return RoundTrigger.PERIODIC
@@ -273,7 +267,7 @@ def _rest_ends(session: Session, campaign: Campaign) -> datetime:
     """When rounds may start by themselves again after those that failed or were cancelled."""
     ended = session.execute(
         select(Round.state, Round.finished_at)
-        .where(Round.campaign_id == campaign.id, Round.publish_rule != PublishRule.NEVER)
+        .where(may_learn(campaign))
         .order_by(Round.id.desc())
         .limit(20)  # after so many in a row the rest is longer than anybody waits
     ).all()
