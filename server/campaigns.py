@@ -20,11 +20,11 @@ from server.publications import record_start, rollback_target
 from server.snapshots import new_labels_since_round
 from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs
+from server.store.campaigns import lock_campaign
 from server.store.events import audit
 from server.store.labels import is_effective
 from server.store.leases import count_reported
 from server.store.pairs import count_by_state
-from server.store.session import LOCK
 from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Job, Label, Pair
 
 
@@ -117,9 +117,7 @@ def change_campaign(
     ConflictError for a taken name, or for another criterion once there are labels, because they
     were given under the old one.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     changed: dict[str, Any] = {}
     if criterion is not None and criterion.strip() != campaign.criterion.strip():
         labels = select(Label.id).where(Label.campaign_id == campaign_id).limit(1)
@@ -160,9 +158,7 @@ def start_collect(
     Raises NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more
     pairs than the episodes can form.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     payload: dict[str, Any] = campaign.settings["collect"] | dict(overrides)

@@ -26,9 +26,9 @@ from server.states import (
     RoundTrigger,
 )
 from server.store import jobs
+from server.store.campaigns import lock_campaign
 from server.store.events import add_event, audit
 from server.store.labels import has_decisive_label
-from server.store.session import LOCK
 from server.store.tables import Campaign, Job, Pair, Round
 
 FINAL_STATES = frozenset(
@@ -84,7 +84,7 @@ def launch(
     round of the campaign may still publish; UnknownNameError or ValueOutOfRangeError for a wrong
     configuration.
     """
-    campaign = _locked(session, campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     settings = campaign.settings
@@ -111,13 +111,6 @@ def launch(
     session.flush()
     _queue(session, now, new_round)
     return new_round
-
-
-def _locked(session: Session, campaign_id: int) -> Campaign:
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
-    return campaign
 
 
 def _queue(session: Session, now: datetime, new_round: Round) -> None:
@@ -224,7 +217,7 @@ def retry_job(session: Session, now: datetime, job_id: int, *, by: int | None) -
     if job.round_id is not None:
         # As a launch does, so that of both at once one wins. Job, campaign, round: the order in
         # which a publishing step locks them.
-        _locked(session, job.campaign_id)
+        lock_campaign(session, job.campaign_id)
         failed = session.get_one(Round, job.round_id, with_for_update=True)
         if failed.state == RoundState.FAILED:
             if failed.publish_rule != PublishRule.NEVER:
@@ -281,7 +274,7 @@ def _rest_ends(session: Session, campaign: Campaign) -> datetime:
 
 def launch_due(session: Session, now: datetime, campaign_id: int) -> Round | None:
     """Start the round that is due, if one is; two ticks at once start one round."""
-    campaign = _locked(session, campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     trigger = is_due(session, now, campaign)
     if trigger is None:
         return None

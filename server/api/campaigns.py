@@ -28,6 +28,7 @@ from server.schemas.common import Page
 from server.schemas.rounds import AuditOut, JobOut, TaskOut
 from server.sign_in import Me
 from server.states import Role
+from server.store.campaigns import lock_campaign
 from server.store.paging import page
 from server.store.tables import AuditEntry, Campaign, Publication
 
@@ -95,7 +96,8 @@ def change_campaign(
     """Rename, archive, or change settings (partly)."""
     settings = None
     if body.settings is not None:
-        before = campaigns.get_campaign(session, campaign_id).settings
+        # Locked before they are read: what somebody else changes meanwhile is kept.
+        before = lock_campaign(session, campaign_id).settings
         settings = _merge_settings(before, body.settings)
     campaign = campaigns.change_campaign(
         session,

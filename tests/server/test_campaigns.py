@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 from sqlalchemy import select
 
 from server.states import Choice, JobKind, JobState
+from server.store.campaigns import lock_campaign
 from server.store.tables import Job
 from tests import factories
 from tests.server.threads import at_once
@@ -120,6 +122,21 @@ def test_settings_change_partly_and_are_checked(world: World) -> None:
     other_id, _ = world.add_campaign()
     taken = admin.patch(f"/campaigns/{other_id}", json={"name": "renamed"})
     assert taken.status_code == 409
+
+
+def test_settings_that_two_change_at_once_are_both_kept(world: World) -> None:
+    campaign_id, _ = world.add_campaign()
+    admin, path = world.client("ada"), f"/campaigns/{campaign_id}"
+    with ThreadPoolExecutor(1) as pool:
+        with world.database.write() as session:
+            campaign = lock_campaign(session, campaign_id)
+            campaign.settings = campaign.settings | {"labels_per_pair": 2}
+            session.flush()
+            other = pool.submit(lambda: admin.patch(path, json={"settings": {"method": "rodif"}}))
+            with pytest.raises(TimeoutError):
+                other.result(timeout=0.5)  # what it merges into is not known before
+        answer = other.result(timeout=30)
+    assert answer.json()["settings"] == DEFAULTS | {"labels_per_pair": 2, "method": "rodif"}
 
 
 def test_the_criterion_cannot_change_under_given_labels(world: World) -> None:

@@ -234,6 +234,20 @@ def test_settings_are_changed_in_the_dialog(studio: Studio, page: Page) -> None:
     assert row.settings["round_after_labels"] == 40
 
 
+def test_settings_that_another_admin_changes_meanwhile_are_kept(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("Start a round by itself").fill("40")
+    with studio.database.write() as session:
+        row = session.get_one(Campaign, campaign)
+        row.settings = row.settings | {"publish_rule": "manual", "labels_per_pair": 3}
+        expected = row.settings | {"round_after_labels": 40}
+    confirm(page, "Save")
+    with studio.database.read() as session:
+        assert session.get_one(Campaign, campaign).settings == expected
+
+
 def test_settings_are_stored_beside_a_criterion_that_ends_in_a_new_line(
     studio: Studio, page: Page
 ) -> None:

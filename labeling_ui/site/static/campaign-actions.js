@@ -79,8 +79,10 @@ export function campaignActions(id, data, refresh) {
         { name: "evaluation_episodes", label: "Evaluation runs", kind: "number", value: now.evaluation_episodes, min: 10, max: 10000, step: 1, required: true },
         { name: "archived", label: "Campaign", kind: "select", value: String(before.archived), options: ARCHIVED, hint: "An archived campaign hands out no pairs and starts no rounds; nothing is deleted." },
       ],
-      // Only what was edited: the criterion is fixed once there are labels.
-      onSubmit: ({ name, criterion, archived, ...changed }) => {
+      // Only what was edited: the criterion is fixed once there are labels, and what somebody else
+      // has changed meanwhile is not to be changed back.
+      onSubmit: ({ name, criterion, archived, ...given }) => {
+        const changed = Object.fromEntries(Object.entries(given).filter(([key, value]) => value !== now[key]));
         const renamed = name === before.name ? {} : { name };
         const asked = criterion === plain(before.criterion) ? {} : { criterion };
         const moved = archived === String(before.archived) ? {} : { archived: archived === "true" };
