@@ -15,7 +15,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from rodif_core.spec import EVALUATION_SEED, FinetuneConfig, settings_for_task
-from server.errors import ConflictError, NotFoundError
+from server.errors import ConflictError, NotAllowedError, NotFoundError
 from server.snapshots import may_learn, new_labels_since_round, snapshot_to_learn_from
 from server.states import (
     JobKind,
@@ -77,18 +77,22 @@ def launch(
     *,
     trigger: RoundTrigger = RoundTrigger.MANUAL,
     started_by: int | None = None,
+    may_loosen: bool = False,
 ) -> Round:
     """Freeze the snapshot, store the round, queue its fine-tuning.
 
-    Raises NotFoundError; ConflictError when no label says which one is better, or when another
-    round of the campaign may still publish; UnknownNameError or ValueOutOfRangeError for a wrong
-    configuration.
+    `may_loosen`: the round's publish rule may be looser than the campaign's. Raises NotFoundError;
+    NotAllowedError for such a rule without it; ConflictError when no label says which one is
+    better, or when another round of the campaign may still publish; UnknownNameError or
+    ValueOutOfRangeError for a wrong configuration.
     """
     campaign = lock_campaign(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     settings = campaign.settings
     publish_rule = PublishRule(request.publish_rule or settings["publish_rule"])
+    if not may_loosen:
+        _refuse_looser(campaign, publish_rule)
     config = _config(request, campaign.task, method=settings["method"])
     if publish_rule != PublishRule.NEVER:
         _refuse_second_publishing_round(session, campaign_id)
@@ -111,6 +115,17 @@ def launch(
     session.flush()
     _queue(session, now, new_round)
     return new_round
+
+
+def _refuse_looser(campaign: Campaign, wanted: PublishRule) -> None:
+    """Whoever may not publish may not have a round do it either."""
+    usual = PublishRule(campaign.settings["publish_rule"])
+    if not usual.allows(wanted):
+        legal = ", ".join(repr(rule.value) for rule in PublishRule if usual.allows(rule))
+        raise NotAllowedError(
+            f"publish_rule {wanted.value!r} is looser than {usual.value!r} of campaign"
+            f" {campaign.id}, which needs role 'admin'; without it legal values are {legal}"
+        )
 
 
 def _queue(session: Session, now: datetime, new_round: Round) -> None:

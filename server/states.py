@@ -95,11 +95,16 @@ class RoundTrigger(StrEnum):
 
 
 class PublishRule(StrEnum):
-    """What a round does with its candidate after the evaluation."""
+    """What a round does with its candidate after the evaluation; the loosest rule first."""
 
     AUTO = "auto"  # publish when the gate passes
     MANUAL = "manual"  # evaluate the gate, wait for an admin
     NEVER = "never"  # comparison round: never offered for publishing
+
+    def allows(self, other: PublishRule) -> bool:
+        """Whether `other` publishes no more easily than this rule."""
+        loosest_first = list(PublishRule)
+        return loosest_first.index(other) >= loosest_first.index(self)
 
 
 class PairStrategy(StrEnum):

@@ -12,6 +12,7 @@ from sqlalchemy import select
 from server import campaigns, checkpoints, publications
 from server.api.access import Admin, Anyone, ReadSession, Staff, UseServices, WriteSession
 from server.api.params import Cursor, Limit, PathId
+from server.errors import NotAllowedError
 from server.schemas.campaigns import (
     CampaignCreate,
     CampaignOut,
@@ -93,12 +94,13 @@ def change_campaign(
     session: WriteSession,
     services: UseServices,
 ) -> CampaignOut:
-    """Rename, archive, or change settings (partly)."""
+    """Rename, archive, or change settings (partly); the publish rule as an admin only."""
     settings = None
     if body.settings is not None:
         # Locked before they are read: what somebody else changes meanwhile is kept.
         before = lock_campaign(session, campaign_id).settings
         settings = _merge_settings(before, body.settings)
+        _refuse_another_rule(before["publish_rule"], settings["publish_rule"], me)
     campaign = campaigns.change_campaign(
         session,
         services.clock(),
@@ -110,6 +112,15 @@ def change_campaign(
         by=me.id,
     )
     return CampaignOut.model_validate(campaign)
+
+
+def _refuse_another_rule(before: str, after: str, me: Me) -> None:
+    """Publishing is for admins, and so is the rule by which rounds publish."""
+    if after != before and me.role != Role.ADMIN:
+        raise NotAllowedError(
+            f"publish_rule {after!r} instead of {before!r} needs role 'admin';"
+            f" {me.name!r} has {me.role.value!r}"
+        )
 
 
 def _merge_settings(before: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:

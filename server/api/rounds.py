@@ -24,7 +24,7 @@ from server.schemas.rounds import (
     RoundCreate,
     RoundOut,
 )
-from server.states import JobState
+from server.states import JobState, Role
 from server.store.paging import page
 from server.store.tables import Checkpoint, Event, Job, LabelSnapshot, Round
 
@@ -128,6 +128,7 @@ def launch_round(
             seed=body.seed,
         ),
         started_by=me.id,
+        may_loosen=me.role == Role.ADMIN,
     )
     response.headers["Location"] = f"/api/v1/rounds/{started.id}"
     return _round_out(session, started)

@@ -124,6 +124,22 @@ def test_settings_change_partly_and_are_checked(world: World) -> None:
     assert taken.status_code == 409
 
 
+def test_the_publish_rule_is_changed_by_admins_only(sqlite_world: World) -> None:
+    campaign_id, _ = sqlite_world.add_campaign(publish_rule="manual")
+    script, path = sqlite_world.client("sam"), f"/campaigns/{campaign_id}"
+    for rule in ("auto", "never"):
+        answer = script.patch(path, json={"name": "x", "settings": {"publish_rule": rule}})
+        assert answer.status_code == 403
+        assert answer.json()["detail"] == (
+            f"publish_rule '{rule}' instead of 'manual' needs role 'admin'; 'sam' has 'service'"
+        )
+    same = {"settings": {"publish_rule": "manual", "round_after_labels": 5}}
+    kept = script.patch(path, json=same).json()
+    assert (kept["name"], kept["settings"]["round_after_labels"]) == ("campaign 0", 5)
+    changed = sqlite_world.client("ada").patch(path, json={"settings": {"publish_rule": "auto"}})
+    assert changed.json()["settings"]["publish_rule"] == "auto"
+
+
 def test_settings_that_two_change_at_once_are_both_kept(world: World) -> None:
     campaign_id, _ = world.add_campaign()
     admin, path = world.client("ada"), f"/campaigns/{campaign_id}"

@@ -146,6 +146,32 @@ def test_a_second_publishing_round_is_refused_while_one_runs(world: World) -> No
     assert _launch(world, campaign_id).status_code == 202
 
 
+@pytest.mark.parametrize(
+    ("usual", "legal"),
+    [
+        ("auto", ["auto", "manual", "never"]),
+        ("manual", ["manual", "never"]),
+        ("never", ["never"]),
+    ],
+)
+@pytest.mark.parametrize("wanted", ["auto", "manual", "never"])
+def test_only_admins_start_rounds_that_publish_more_easily_than_the_campaign_says(
+    sqlite_world: World, usual: str, legal: list[str], wanted: str
+) -> None:
+    campaign_id = _labelled(sqlite_world, publish_rule=usual)
+    path = f"/campaigns/{campaign_id}/rounds"
+    answer = sqlite_world.client("sam").post(path, json={"publish_rule": wanted})
+    if wanted in legal:
+        assert (answer.status_code, answer.json()["publish_rule"]) == (202, wanted)
+        return
+    assert answer.status_code == 403
+    told = answer.json()["detail"]
+    assert f"publish_rule '{wanted}' is looser than '{usual}' of campaign {campaign_id}" in told
+    assert told.endswith("legal values are " + ", ".join(f"'{rule}'" for rule in legal))
+    assert sqlite_world.sent == []
+    assert _launch(sqlite_world, campaign_id, publish_rule=wanted).status_code == 202
+
+
 def test_of_many_launches_at_once_one_wins(world: World) -> None:
     campaign_id = _labelled(world)
     answers = at_once([lambda: _launch(world, campaign_id)] * 4)
