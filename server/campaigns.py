@@ -155,17 +155,15 @@ def start_collect(
     """Queue rollouts of the published policy; `overrides` are checked settings without None.
 
     Without a seed the episodes follow those of the collect jobs before, so that none is repeated.
-    Raises NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more
-    pairs than the episodes can form.
+    Without a number of pairs it is the campaign's, or as many as the episodes can form. Raises
+    NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more pairs than
+    the episodes can form.
     """
     campaign = lock_campaign(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     payload: dict[str, Any] = campaign.settings["collect"] | dict(overrides)
-    episodes = int(payload["episodes"])
-    possible = episodes * (episodes - 1) // 2
-    if payload["pairs"] > possible:
-        raise ValueOutOfRangeError("pairs", payload["pairs"], f"at most {possible} of {episodes}")
+    payload["pairs"] = _possible_pairs(payload["episodes"], payload["pairs"], "pairs" in overrides)
     payload["checkpoint_id"] = campaign.published_checkpoint_id
     if "seed" not in payload:
         payload["seed"] = _next_seed(session, campaign)
@@ -187,6 +185,15 @@ def start_collect(
     )
     session.flush()
     return job
+
+
+def _possible_pairs(episodes: int, pairs: int, asked_for: bool) -> int:
+    """`pairs`, or fewer where the campaign's usual number is more than the episodes can form."""
+    possible = episodes * (episodes - 1) // 2
+    if asked_for and pairs > possible:
+        legal = f"at most {possible}, the pairs of {episodes} episodes"
+        raise ValueOutOfRangeError("pairs", pairs, legal)
+    return min(pairs, possible)
 
 
 def _next_seed(session: Session, campaign: Campaign) -> int:

@@ -213,6 +213,25 @@ def test_collecting_queues_a_job_and_tells_where_to_follow_it(world: World) -> N
     assert (found["kind"], found["state"], found["progress"]) == ("collect", "queued", 0.0)
 
 
+@pytest.mark.parametrize(
+    ("asked", "pairs"),
+    [
+        ({"episodes": 10}, 45),  # 10 · 9 / 2
+        ({"episodes": 18}, 150),  # of 153; the campaign's number
+        ({}, 150),
+        ({"episodes": 10, "pairs": 45}, 45),
+    ],
+)
+def test_collecting_few_episodes_makes_the_pairs_that_there_are(
+    sqlite_world: World, asked: dict[str, int], pairs: int
+) -> None:
+    campaign_id, _ = sqlite_world.add_campaign()
+    answer = sqlite_world.client("ada").post(f"/campaigns/{campaign_id}/collect", json=asked)
+    assert answer.status_code == 202
+    with sqlite_world.database.read() as session:
+        assert session.get_one(Job, answer.json()["id"]).payload["pairs"] == pairs
+
+
 def test_collects_never_plan_the_same_seeds_even_at_once(world: World) -> None:
     campaign_id, _ = world.add_campaign()
     path = f"/campaigns/{campaign_id}/collect"
@@ -227,7 +246,8 @@ def test_collects_never_plan_the_same_seeds_even_at_once(world: World) -> None:
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ({"episodes": 3, "pairs": 4}, "pairs is 4, but must be at most 3"),
+        ({"episodes": 3, "pairs": 4}, "pairs is 4, but must be at most 3, the pairs of 3 episodes"),
+        ({"pairs": 1771}, "pairs is 1771, but must be at most 1770, the pairs of 60 episodes"),
         ({"episodes": 1}, "greater than or equal to 2"),
         ({"random_share": 1.5}, "less than or equal to 1"),
         ({"random_share": "0.5"}, "valid number"),
