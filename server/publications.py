@@ -51,14 +51,29 @@ def publish(
 
 
 def rollback(
-    session: Session, now: datetime, *, campaign_id: int, reason: str, by: int | None
+    session: Session,
+    now: datetime,
+    *,
+    campaign_id: int,
+    reason: str,
+    by: int | None,
+    checkpoint_id: int | None = None,
 ) -> Publication:
-    """Move the alias back to what was published before; raises ConflictError at the start."""
+    """Move the alias back to what was published before.
+
+    `checkpoint_id` is what the caller expects that to be. Raises NotFoundError; ConflictError at
+    the start, and when it is another checkpoint by now.
+    """
     campaign = lock_campaign(session, campaign_id)
     before = rollback_target(session, campaign_id)
     if before is None:
         raise ConflictError(
             f"campaign {campaign_id} is at its starting checkpoint; there is nothing to roll back"
+        )
+    if checkpoint_id not in (None, before):
+        raise ConflictError(
+            f"a rollback of campaign {campaign_id} would now publish checkpoint {before},"
+            f" not {checkpoint_id}; look again, then roll back to {before}"
         )
     return _move(session, now, campaign, before, action="rollback", reason=reason, by=by)
 

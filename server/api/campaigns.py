@@ -186,7 +186,12 @@ def rollback(
 ) -> PublicationOut:
     """Publish again what was published before."""
     moved = publications.rollback(
-        session, services.clock(), campaign_id=campaign_id, reason=body.reason, by=me.id
+        session,
+        services.clock(),
+        campaign_id=campaign_id,
+        checkpoint_id=body.checkpoint_id,
+        reason=body.reason,
+        by=me.id,
     )
     return PublicationOut.model_validate(moved)
 

@@ -378,10 +378,24 @@ def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
     shown.get_by_text("comparison", exact=True).wait_for()
     assert shown.get_by_role("button", name="Publish").count() == 0
     page.get_by_role("button", name="Roll back").click()
+    page.get_by_role("dialog", name=f"Roll back to {second.name}?").wait_for()
     confirm(page, "Roll back")
     page.locator(f'[data-checkpoint="{second.id}"]').get_by_text("published").wait_for()
     page.get_by_role("button", name="Roll back").click()
-    confirm(page, "Roll back")
+    dialog = page.get_by_role("dialog", name="Roll back to avoid-pretrained?")
+    with studio.database.write() as session:  # somebody else is quicker
+        publications.publish(
+            session, now, campaign_id=campaign, checkpoint_id=start, reason="", by=None
+        )
+    dialog.get_by_role("button", name="Roll back").click()
+    refusal = f"would now publish checkpoint {second.id}, not {start}"
+    dialog.get_by_role("alert").get_by_text(refusal).wait_for()
+    dialog.get_by_role("button", name="Cancel").click()
+    page.locator(f'[data-checkpoint="{start}"]').get_by_text("published").wait_for()
+    for target in (second.id, start):
+        page.get_by_role("button", name="Roll back").click()
+        confirm(page, "Roll back")
+        page.locator(f'[data-checkpoint="{target}"]').get_by_text("published").wait_for()
     page.locator("#rollback:disabled").wait_for()
 
 

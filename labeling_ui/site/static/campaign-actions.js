@@ -91,8 +91,11 @@ export function campaignActions(id, data, refresh) {
     });
   };
 
+  const nameOf = (checkpointId) =>
+    data.checkpoints.find((item) => item.id === checkpointId)?.name ?? `Checkpoint ${checkpointId}`;
+
   const publish = (checkpointId) => {
-    const { name } = data.checkpoints.find((item) => item.id === checkpointId) ?? { name: `Checkpoint ${checkpointId}` };
+    const name = nameOf(checkpointId);
     return confirmed(`${name} is published.`, {
       title: `Publish ${name}?`,
       text: "From now on runs are collected from it, and rounds start from it. It can be rolled back.",
@@ -102,14 +105,18 @@ export function campaignActions(id, data, refresh) {
     });
   };
 
-  const rollBack = () => confirmed("Rolled back.", {
-    title: "Roll back?",
-    text: "Publishes again what was published before. Nothing is deleted.",
-    confirm: "Roll back",
-    danger: true,
-    fields: [REASON],
-    onSubmit: ({ reason }) => post(`/campaigns/${id}/rollback`, { reason }),
-  });
+  const rollBack = () => {
+    const checkpoint_id = data.stats.rollback_checkpoint_id; // as the dialog names it
+    const name = nameOf(checkpoint_id);
+    return confirmed(`Rolled back to ${name}.`, {
+      title: `Roll back to ${name}?`,
+      text: `Publishes ${name} again, which was published before. Nothing is deleted.`,
+      confirm: "Roll back",
+      danger: true,
+      fields: [REASON],
+      onSubmit: ({ reason }) => post(`/campaigns/${id}/rollback`, { checkpoint_id, reason }),
+    });
+  };
 
   const cancel = (round) => confirmed(`Round ${round.id} is cancelled.`, {
     title: `Cancel round ${round.id}?`,
