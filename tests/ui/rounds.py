@@ -92,8 +92,8 @@ class WorkerStandIn:
             add_event(session, now, kind="job", data=told, **where)
 
     def finish(self, before: dict[str, Any], after: dict[str, Any]) -> int:
-        """Candidate, evaluation, gate, and publication unless it is a comparison round; returns
-        the candidate's id."""
+        """Candidate, evaluation, gate, and publication if the round's rule is "auto"; returns the
+        candidate's id."""
         now = datetime.now(UTC)
         with self.studio.database.write() as session:
             this = session.get_one(Round, self.round_id)
@@ -123,7 +123,7 @@ class WorkerStandIn:
             for state in (RoundState.EVALUATING, RoundState.GATING):
                 rounds.move(session, now, self.round_id, state)
             session.get_one(Job, self.job_id).state = "done"
-            if this.publish_rule == PublishRule.NEVER:
+            if this.publish_rule != PublishRule.AUTO:
                 rounds.move(session, now, self.round_id, RoundState.KEPT)
                 return candidate.id
             publications.publish(

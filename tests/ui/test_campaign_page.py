@@ -399,6 +399,30 @@ def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
     page.locator("#rollback:disabled").wait_for()
 
 
+@pytest.mark.parametrize(
+    ("rule", "told"),
+    [
+        (PublishRule.NEVER, "The gate passed · for comparison, never published"),
+        (PublishRule.MANUAL, "The gate passed · kept for an admin to publish"),
+    ],
+)
+def test_page_says_of_a_kept_candidate_whether_it_can_be_published(
+    studio: Studio, page: Page, rule: PublishRule, told: str
+) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    with studio.database.write() as session:
+        request = rounds.RoundRequest(publish_rule=rule)
+        this = rounds.launch(session, datetime.now(UTC), campaign, request).id
+    worker = WorkerStandIn(studio, this)
+    worker.start()
+    candidate = worker.finish(evaluation(22, 70, 8), evaluation(91, 3, 6))
+    open_campaign(page, studio, campaign)
+    page.locator("#behaviour .gate").get_by_text(told).wait_for()
+    offered = page.locator(f'[data-checkpoint="{candidate}"]').get_by_role("button", name="Publish")
+    assert offered.count() == (0 if rule is PublishRule.NEVER else 1)
+
+
 def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Page) -> None:
     campaign = studio.add_campaign()
     open_campaign(page, studio, campaign)

@@ -135,12 +135,16 @@ export function legend(evaluations, facts) {
   );
 }
 
-export function gate(verdict, state) {
+// What the gate of a round said, and what became of the candidate where that is not plain.
+export function gate(round) {
+  const verdict = round?.result?.gate;
   if (!verdict) return null;
   const title = verdict.passed ? "The gate passed" : "The gate refused";
   return element(
     "div.gate", {},
-    element("strong", {}, title), state === "kept" ? " · kept for an admin to publish" : "",
+    element("strong", {}, title), round.state === "kept" ? ` · ${whyKept(round)}` : "",
     element("ul", {}, verdict.reasons.map((reason) => element("li", {}, reason))),
   );
 }
+
+const whyKept = (round) => round.publish_rule === "never" ? "for comparison, never published" : "kept for an admin to publish";
