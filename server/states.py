@@ -81,7 +81,7 @@ class RoundState(StrEnum):
     GATING = "gating"
     PUBLISHED = "published"  # the gate passed and the alias moved
     REJECTED = "rejected"  # the gate refused; the candidate stays on record
-    KEPT = "kept"  # publish = manual | never: the candidate waits for an admin
+    KEPT = "kept"  # publish = manual | never, nothing new, or the alias has moved: not published
     FAILED = "failed"
     CANCELLED = "cancelled"
 

@@ -379,6 +379,29 @@ def test_curves_are_the_points_of_the_round_in_order(world: World) -> None:
     assert points[1] == {"stage": "score", "step": 1, "loss": 0.5}
 
 
+@pytest.mark.parametrize(
+    ("metrics", "told"),
+    [
+        ({"finetune": {"stopped": "the gate shut at update 0", "curve": []}}, "the gate shut at"),
+        ({"finetune": {"chosen": {}}}, None),
+        ({}, None),
+    ],
+)
+def test_a_round_tells_why_its_fine_tuning_stopped(
+    world: World, metrics: dict[str, Any], told: str | None
+) -> None:
+    campaign_id = _labelled(world)
+    round_id = _launch(world, campaign_id).json()["id"]
+    client = world.client("sam")
+    assert client.get(f"/rounds/{round_id}").json()["stopped"] is None  # it goes on
+    with world.database.write() as session:
+        made = factories.add_checkpoint(session, "candidate", parent_id=1, round_id=round_id)
+        made.metrics = metrics
+    one = client.get(f"/rounds/{round_id}").json()
+    assert one["stopped"] is None if told is None else one["stopped"].startswith(told)
+    assert client.get(f"/campaigns/{campaign_id}/rounds").json()["items"] == [one]
+
+
 def test_rounds_are_listed_newest_first_without_what_their_evaluations_draw(world: World) -> None:
     campaign_id = _labelled(world)
     ids = [_launch(world, campaign_id, publish_rule="never").json()["id"] for _ in range(3)]

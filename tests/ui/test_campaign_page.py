@@ -423,6 +423,20 @@ def test_page_says_of_a_kept_candidate_whether_it_can_be_published(
     assert offered.count() == (0 if rule is PublishRule.NEVER else 1)
 
 
+def test_page_says_why_a_round_learned_nothing(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    with studio.database.write() as session:
+        this = rounds.launch(session, datetime.now(UTC), campaign, rounds.RoundRequest()).id
+    worker, same = WorkerStandIn(studio, this), evaluation(22, 70, 8)
+    worker.start()
+    worker.finish(same, same, unchanged="dead gradient: use a conservativeness below 0.5")
+    open_campaign(page, studio, campaign)
+    said = page.locator("#behaviour .gate")
+    said.get_by_text("The gate passed · not published, nothing was learned").wait_for()
+    said.get_by_text("Fine-tuning: dead gradient: use a conservativeness below 0.5").wait_for()
+
+
 def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Page) -> None:
     campaign = studio.add_campaign()
     open_campaign(page, studio, campaign)

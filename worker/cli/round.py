@@ -127,6 +127,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         rows = list(finished_tables(ended).items())
         Console().print(evaluation_table(f"round {ended['id']}", rows))
+        if ended.get("stopped"):
+            print(f"fine-tuning: {ended['stopped']}")
+    if ended["result"]["gate"].get("unchanged"):
+        print("nothing was learned: the candidate has its parent's weights", file=sys.stderr)
     if ended["state"] == "rejected":
         print(f"the gate refused: {ended['result'].get('gate')}", file=sys.stderr)
         return 1

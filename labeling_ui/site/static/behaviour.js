@@ -144,7 +144,11 @@ export function gate(round) {
     "div.gate", {},
     element("strong", {}, title), round.state === "kept" ? ` · ${whyKept(round)}` : "",
     element("ul", {}, verdict.reasons.map((reason) => element("li", {}, reason))),
+    round.stopped ? element("p.muted.small", {}, `Fine-tuning: ${round.stopped}`) : null,
   );
 }
 
-const whyKept = (round) => round.publish_rule === "never" ? "for comparison, never published" : "kept for an admin to publish";
+function whyKept({ publish_rule, result }) {
+  if (publish_rule === "never") return "for comparison, never published";
+  return result.gate.unchanged ? "not published, nothing was learned" : "kept for an admin to publish";
+}
