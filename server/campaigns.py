@@ -20,11 +20,11 @@ from server.publications import record_start, rollback_target
 from server.snapshots import new_labels_since_round
 from server.states import DECISIVE, Choice, JobKind, JobState, PairState
 from server.store import jobs
+from server.store.campaigns import lock_campaign
 from server.store.events import audit
 from server.store.labels import is_effective
 from server.store.leases import count_reported
 from server.store.pairs import count_by_state
-from server.store.session import LOCK
 from server.store.tables import Annotator, Campaign, Checkpoint, Episode, Job, Label, Pair
 
 
@@ -117,9 +117,7 @@ def change_campaign(
     ConflictError for a taken name, or for another criterion once there are labels, because they
     were given under the old one.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     changed: dict[str, Any] = {}
     if criterion is not None and criterion.strip() != campaign.criterion.strip():
         labels = select(Label.id).where(Label.campaign_id == campaign_id).limit(1)
@@ -157,19 +155,15 @@ def start_collect(
     """Queue rollouts of the published policy; `overrides` are checked settings without None.
 
     Without a seed the episodes follow those of the collect jobs before, so that none is repeated.
-    Raises NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more
-    pairs than the episodes can form.
+    Without a number of pairs it is the campaign's, or as many as the episodes can form. Raises
+    NotFoundError, ConflictError for an archived campaign, ValueOutOfRangeError for more pairs than
+    the episodes can form.
     """
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     payload: dict[str, Any] = campaign.settings["collect"] | dict(overrides)
-    episodes = int(payload["episodes"])
-    possible = episodes * (episodes - 1) // 2
-    if payload["pairs"] > possible:
-        raise ValueOutOfRangeError("pairs", payload["pairs"], f"at most {possible} of {episodes}")
+    payload["pairs"] = _possible_pairs(payload["episodes"], payload["pairs"], "pairs" in overrides)
     payload["checkpoint_id"] = campaign.published_checkpoint_id
     if "seed" not in payload:
         payload["seed"] = _next_seed(session, campaign)
@@ -193,6 +187,15 @@ def start_collect(
     return job
 
 
+def _possible_pairs(episodes: int, pairs: int, asked_for: bool) -> int:
+    """`pairs`, or fewer where the campaign's usual number is more than the episodes can form."""
+    possible = episodes * (episodes - 1) // 2
+    if asked_for and pairs > possible:
+        legal = f"at most {possible}, the pairs of {episodes} episodes"
+        raise ValueOutOfRangeError("pairs", pairs, legal)
+    return min(pairs, possible)
+
+
 def _next_seed(session: Session, campaign: Campaign) -> int:
     """First seed that no collect job has planned and no episode of the campaign has used."""
     used = session.scalar(
@@ -211,7 +214,7 @@ def _next_seed(session: Session, campaign: Campaign) -> int:
 
 def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
     """Figures of the campaign, as `StatsOut` shows them; raises NotFoundError."""
-    get_campaign(session, campaign_id)
+    campaign = get_campaign(session, campaign_id)
     pairs = count_by_state(session, campaign_id)
     answers = _answers(session, campaign_id)
     episodes = select(func.count()).where(Episode.campaign_id == campaign_id)
@@ -228,7 +231,7 @@ def campaign_stats(session: Session, campaign_id: int) -> dict[str, Any]:
             ),
             "reported": count_reported(session, campaign_id),
         },
-        "labels": _label_counts(session, campaign_id, answers),
+        "labels": _label_counts(session, campaign, answers),
         "annotators": _annotator_counts(session, campaign_id, answers),
         "jobs": _job_counts(session, campaign_id),
         "rollback_checkpoint_id": rollback_target(session, campaign_id),
@@ -257,8 +260,8 @@ def _answers(session: Session, campaign_id: int) -> list[_Answers]:
     return [_Answers(*row) for row in session.execute(query)]
 
 
-def _label_counts(session: Session, campaign_id: int, answers: list[_Answers]) -> dict[str, Any]:
-    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign_id))
+def _label_counts(session: Session, campaign: Campaign, answers: list[_Answers]) -> dict[str, Any]:
+    total = session.scalar(select(func.count()).where(Label.campaign_id == campaign.id))
     found: Counter[str] = Counter()
     for answer in answers:
         found[answer.choice] += answer.count
@@ -267,7 +270,7 @@ def _label_counts(session: Session, campaign_id: int, answers: list[_Answers]) -
         "total": total,
         "effective": sum(by_choice.values()),
         "by_choice": by_choice,
-        "new_since_round": new_labels_since_round(session, campaign_id),
+        "new_since_round": new_labels_since_round(session, campaign),
     }
 
 

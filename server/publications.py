@@ -9,8 +9,8 @@ from sqlalchemy.orm import Session
 
 from server.errors import ConflictError, NotFoundError
 from server.states import PublishRule
+from server.store.campaigns import lock_campaign
 from server.store.events import add_event, audit
-from server.store.session import LOCK
 from server.store.tables import Campaign, Checkpoint, Episode, Publication, Round
 
 
@@ -28,7 +28,7 @@ def publish(
     Raises NotFoundError, or ConflictError for a checkpoint of another task, of another pretrained
     policy than the campaign's runs, of a comparison round, or one that is published already.
     """
-    campaign = _locked_campaign(session, campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     checkpoint = session.get(Checkpoint, checkpoint_id)
     if checkpoint is None:
         raise NotFoundError("checkpoint", checkpoint_id)
@@ -51,14 +51,29 @@ def publish(
 
 
 def rollback(
-    session: Session, now: datetime, *, campaign_id: int, reason: str, by: int | None
+    session: Session,
+    now: datetime,
+    *,
+    campaign_id: int,
+    reason: str,
+    by: int | None,
+    checkpoint_id: int | None = None,
 ) -> Publication:
-    """Move the alias back to what was published before; raises ConflictError at the start."""
-    campaign = _locked_campaign(session, campaign_id)
+    """Move the alias back to what was published before.
+
+    `checkpoint_id` is what the caller expects that to be. Raises NotFoundError; ConflictError at
+    the start, and when it is another checkpoint by now.
+    """
+    campaign = lock_campaign(session, campaign_id)
     before = rollback_target(session, campaign_id)
     if before is None:
         raise ConflictError(
             f"campaign {campaign_id} is at its starting checkpoint; there is nothing to roll back"
+        )
+    if checkpoint_id not in (None, before):
+        raise ConflictError(
+            f"a rollback of campaign {campaign_id} would now publish checkpoint {before},"
+            f" not {checkpoint_id}; look again, then roll back to {before}"
         )
     return _move(session, now, campaign, before, action="rollback", reason=reason, by=by)
 
@@ -112,13 +127,6 @@ def _pretrained(session: Session, checkpoint: Checkpoint) -> Checkpoint:
     while checkpoint.parent_id is not None:
         checkpoint = session.get_one(Checkpoint, checkpoint.parent_id)
     return checkpoint
-
-
-def _locked_campaign(session: Session, campaign_id: int) -> Campaign:
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
-    return campaign
 
 
 def _move(

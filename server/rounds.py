@@ -15,8 +15,8 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from rodif_core.spec import EVALUATION_SEED, FinetuneConfig, settings_for_task
-from server.errors import ConflictError, NotFoundError
-from server.snapshots import new_labels_since_round, snapshot_to_learn_from
+from server.errors import ConflictError, NotAllowedError, NotFoundError
+from server.snapshots import may_learn, new_labels_since_round, snapshot_to_learn_from
 from server.states import (
     JobKind,
     JobState,
@@ -26,9 +26,9 @@ from server.states import (
     RoundTrigger,
 )
 from server.store import jobs
+from server.store.campaigns import lock_campaign
 from server.store.events import add_event, audit
 from server.store.labels import has_decisive_label
-from server.store.session import LOCK
 from server.store.tables import Campaign, Job, Pair, Round
 
 FINAL_STATES = frozenset(
@@ -77,18 +77,22 @@ def launch(
     *,
     trigger: RoundTrigger = RoundTrigger.MANUAL,
     started_by: int | None = None,
+    may_loosen: bool = False,
 ) -> Round:
     """Freeze the snapshot, store the round, queue its fine-tuning.
 
-    Raises NotFoundError; ConflictError when no label says which one is better, or when another
-    round of the campaign may still publish; UnknownNameError or ValueOutOfRangeError for a wrong
-    configuration.
+    `may_loosen`: the round's publish rule may be looser than the campaign's. Raises NotFoundError;
+    NotAllowedError for such a rule without it; ConflictError when no label says which one is
+    better, or when another round of the campaign may still publish; UnknownNameError or
+    ValueOutOfRangeError for a wrong configuration.
     """
-    campaign = _locked(session, campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     if campaign.archived:
         raise ConflictError(f"campaign {campaign_id} is archived")
     settings = campaign.settings
     publish_rule = PublishRule(request.publish_rule or settings["publish_rule"])
+    if not may_loosen:
+        _refuse_looser(campaign, publish_rule)
     config = _config(request, campaign.task, method=settings["method"])
     if publish_rule != PublishRule.NEVER:
         _refuse_second_publishing_round(session, campaign_id)
@@ -113,11 +117,15 @@ def launch(
     return new_round
 
 
-def _locked(session: Session, campaign_id: int) -> Campaign:
-    campaign = session.get(Campaign, campaign_id, with_for_update=LOCK, populate_existing=True)
-    if campaign is None:
-        raise NotFoundError("campaign", campaign_id)
-    return campaign
+def _refuse_looser(campaign: Campaign, wanted: PublishRule) -> None:
+    """Whoever may not publish may not have a round do it either."""
+    usual = PublishRule(campaign.settings["publish_rule"])
+    if not usual.allows(wanted):
+        legal = ", ".join(repr(rule.value) for rule in PublishRule if usual.allows(rule))
+        raise NotAllowedError(
+            f"publish_rule {wanted.value!r} is looser than {usual.value!r} of campaign"
+            f" {campaign.id}, which needs role 'admin'; without it legal values are {legal}"
+        )
 
 
 def _queue(session: Session, now: datetime, new_round: Round) -> None:
@@ -150,20 +158,17 @@ def _config(request: RoundRequest, task: str, *, method: str) -> FinetuneConfig:
 
 
 def _refuse_second_publishing_round(session: Session, campaign_id: int) -> None:
-    running = session.scalars(_publishing(campaign_id).limit(1)).one_or_none()
+    publishing = select(Round).where(
+        Round.campaign_id == campaign_id,
+        Round.publish_rule != PublishRule.NEVER,
+        Round.state.not_in(FINAL_STATES),
+    )
+    running = session.scalars(publishing.limit(1)).one_or_none()
     if running is not None:
         raise ConflictError(
             f"round {running.id} of campaign {campaign_id} is {running.state!r} and may publish;"
             " wait for it, cancel it, or start a comparison round with publish_rule 'never'"
         )
-
-
-def _publishing(campaign_id: int) -> Any:
-    return select(Round).where(
-        Round.campaign_id == campaign_id,
-        Round.publish_rule != PublishRule.NEVER,
-        Round.state.not_in(FINAL_STATES),
-    )
 
 
 def move(
@@ -227,7 +232,7 @@ def retry_job(session: Session, now: datetime, job_id: int, *, by: int | None) -
     if job.round_id is not None:
         # As a launch does, so that of both at once one wins. Job, campaign, round: the order in
         # which a publishing step locks them.
-        _locked(session, job.campaign_id)
+        lock_campaign(session, job.campaign_id)
         failed = session.get_one(Round, job.round_id, with_for_update=True)
         if failed.state == RoundState.FAILED:
             if failed.publish_rule != PublishRule.NEVER:
@@ -251,18 +256,15 @@ def is_due(session: Session, now: datetime, campaign: Campaign) -> RoundTrigger 
     every_minutes = float(campaign.settings["round_every_minutes"])
     if campaign.archived or (every_labels == 0 and every_minutes == 0):
         return None
-    if session.scalars(_publishing(campaign.id).limit(1)).first() is not None:
+    running = select(Round.id).where(may_learn(campaign), Round.state.not_in(FINAL_STATES))
+    if session.scalar(running.limit(1)) is not None:
         return None
     if now < _rest_ends(session, campaign) or not has_decisive_label(session, campaign.id):
         return None
-    new_labels = new_labels_since_round(session, campaign.id)
+    new_labels = new_labels_since_round(session, campaign)
     if every_labels > 0 and new_labels >= every_labels:
         return RoundTrigger.LABELS
-    last_start = session.scalar(
-        select(func.max(Round.created_at)).where(
-            Round.campaign_id == campaign.id, Round.publish_rule != PublishRule.NEVER
-        )
-    )
+    last_start = session.scalar(select(func.max(Round.created_at)).where(may_learn(campaign)))
     waited = now - (last_start or campaign.created_at)
     if every_minutes > 0 and new_labels > 0 and waited >= timedelta(minutes=every_minutes):
         return RoundTrigger.PERIODIC
@@ -273,7 +275,7 @@ def _rest_ends(session: Session, campaign: Campaign) -> datetime:
     """When rounds may start by themselves again after those that failed or were cancelled."""
     ended = session.execute(
         select(Round.state, Round.finished_at)
-        .where(Round.campaign_id == campaign.id, Round.publish_rule != PublishRule.NEVER)
+        .where(may_learn(campaign))
         .order_by(Round.id.desc())
         .limit(20)  # after so many in a row the rest is longer than anybody waits
     ).all()
@@ -287,7 +289,7 @@ def _rest_ends(session: Session, campaign: Campaign) -> datetime:
 
 def launch_due(session: Session, now: datetime, campaign_id: int) -> Round | None:
     """Start the round that is due, if one is; two ticks at once start one round."""
-    campaign = _locked(session, campaign_id)
+    campaign = lock_campaign(session, campaign_id)
     trigger = is_due(session, now, campaign)
     if trigger is None:
         return None

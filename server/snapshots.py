@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from datetime import datetime
 
-from sqlalchemy import case, func, select
+from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session
 
 from server.errors import ConflictError, NotFoundError
@@ -17,8 +17,9 @@ from server.store.labels import (
     effective_label_ids,
     has_decisive_label,
     snapshot_is_decisive,
+    telling_label_ids,
 )
-from server.store.tables import LabelSnapshot, Round
+from server.store.tables import Campaign, LabelSnapshot, Round
 
 
 def freeze_snapshot(session: Session, now: datetime, campaign_id: int) -> LabelSnapshot:
@@ -74,31 +75,44 @@ def _undecided(campaign_id: int, labels: int) -> ConflictError:
     )
 
 
-def new_labels_since_round(session: Session, campaign_id: int) -> int:
-    """Labels in force that no publishing round has learned from.
+def may_learn(campaign: Campaign) -> ColumnElement[bool]:
+    """Condition on Round: of this campaign, and of the rounds that make its labels old.
 
+    A comparison round leaves them to the rounds that publish. In a campaign that only compares no
+    such round comes, so there comparisons count: else its labels were new for ever, and rounds on
+    the same ones would start without end.
+    """
+    own = Round.campaign_id == campaign.id
+    if campaign.settings["publish_rule"] == PublishRule.NEVER:
+        return own
+    return own & (Round.publish_rule != PublishRule.NEVER)
+
+
+def new_labels_since_round(session: Session, campaign: Campaign) -> int:
+    """Labels in force that say something and that no round has learned from (`may_learn`).
+
+    Nothing can be learned from "cannot tell", so it neither is new nor makes a round due.
     What a round learned is lost when it fails or is cancelled: its labels are new again.
     """
-    digest = _newest_learned(session, campaign_id)
+    telling = telling_label_ids(session, campaign.id)
+    digest = _newest_learned(session, campaign)
     if digest is None:
-        return count_effective(session, campaign_id)
+        return len(telling)
     used = set(session.get_one(LabelSnapshot, digest).label_ids)
-    return sum(label_id not in used for label_id in effective_label_ids(session, campaign_id))
+    return sum(label_id not in used for label_id in telling)
 
 
-def _newest_learned(session: Session, campaign_id: int) -> str | None:
-    """Of the snapshots that publishing rounds learned from, the one that was frozen last.
+def _newest_learned(session: Session, campaign: Campaign) -> str | None:
+    """Of the snapshots that rounds have learned from, the one that was frozen last.
 
     A label that is in force now was in force ever since it was given. So this one holds all labels
     in force that the earlier ones hold, and no other need be read. The first round of a snapshot
     froze it, so the rounds' ids tell which is the last.
     """
-    learned = (Round.publish_rule != PublishRule.NEVER) & Round.state.not_in(
-        (RoundState.FAILED, RoundState.CANCELLED)
-    )
+    learned = may_learn(campaign) & Round.state.not_in((RoundState.FAILED, RoundState.CANCELLED))
     query = (
         select(Round.snapshot_digest)
-        .where(Round.campaign_id == campaign_id)
+        .where(Round.campaign_id == campaign.id)
         .group_by(Round.snapshot_digest)
         .having(func.sum(case((learned, 1), else_=0)) > 0)
         .order_by(func.min(Round.id).desc())

@@ -29,7 +29,8 @@ class Choice(StrEnum):
     CANNOT_TELL = "cannot_tell"
 
 
-DECISIVE = (Choice.FIRST, Choice.SECOND)  # choices that fine-tuning learns from
+DECISIVE = (Choice.FIRST, Choice.SECOND)  # choices that say which episode is better
+TELLING = (*DECISIVE, Choice.EQUAL)  # choices that a round learns from
 
 
 class PairState(StrEnum):
@@ -80,7 +81,7 @@ class RoundState(StrEnum):
     GATING = "gating"
     PUBLISHED = "published"  # the gate passed and the alias moved
     REJECTED = "rejected"  # the gate refused; the candidate stays on record
-    KEPT = "kept"  # publish = manual | never: the candidate waits for an admin
+    KEPT = "kept"  # publish = manual | never, nothing new, or the alias has moved: not published
     FAILED = "failed"
     CANCELLED = "cancelled"
 
@@ -94,11 +95,16 @@ class RoundTrigger(StrEnum):
 
 
 class PublishRule(StrEnum):
-    """What a round does with its candidate after the evaluation."""
+    """What a round does with its candidate after the evaluation; the loosest rule first."""
 
     AUTO = "auto"  # publish when the gate passes
     MANUAL = "manual"  # evaluate the gate, wait for an admin
     NEVER = "never"  # comparison round: never offered for publishing
+
+    def allows(self, other: PublishRule) -> bool:
+        """Whether `other` publishes no more easily than this rule."""
+        loosest_first = list(PublishRule)
+        return loosest_first.index(other) >= loosest_first.index(self)
 
 
 class PairStrategy(StrEnum):

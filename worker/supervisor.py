@@ -32,7 +32,7 @@ from server.settings import Settings
 from server.states import JobState
 from server.store.session import Database
 from server.store.tables import Job, ServiceBeat
-from worker import leash
+from worker import interrupted, leash
 from worker.broker import broker_answers, broker_service, end_orphan_broker, socket_path
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
 from worker.prepare import Prepared, prepare
@@ -251,7 +251,8 @@ def running_system(
     Parts: broker (unless `settings.broker_url` names one elsewhere), API, a worker with `workers`
     job children, tick worker, beat. `settings.port` 0 picks a free port; the address is in `.url`,
     the settings in force in `.settings`, the admin account in `.prepared`. Logs lie in
-    `<state_dir>/logs`. Raises StateInUseError, SystemStartError or ServiceCrashedError.
+    `<state_dir>/logs`. Jobs that the stop interrupts keep their attempts. Raises StateInUseError,
+    SystemStartError or ServiceCrashedError.
     """
     if workers < 1:
         raise ValueOutOfRangeError("workers", workers, "at least 1")
@@ -270,7 +271,9 @@ def running_system(
             system.wait_until_ready(ready_seconds)
             yield system
         finally:
+            at_work = interrupted.claims_of_the_living(settings)
             system.stop()
+            interrupted.hand_back(settings, at_work)
 
 
 @contextlib.contextmanager

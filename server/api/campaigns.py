@@ -12,6 +12,7 @@ from sqlalchemy import select
 from server import campaigns, checkpoints, publications
 from server.api.access import Admin, Anyone, ReadSession, Staff, UseServices, WriteSession
 from server.api.params import Cursor, Limit, PathId
+from server.errors import NotAllowedError
 from server.schemas.campaigns import (
     CampaignCreate,
     CampaignOut,
@@ -28,6 +29,7 @@ from server.schemas.common import Page
 from server.schemas.rounds import AuditOut, JobOut, TaskOut
 from server.sign_in import Me
 from server.states import Role
+from server.store.campaigns import lock_campaign
 from server.store.paging import page
 from server.store.tables import AuditEntry, Campaign, Publication
 
@@ -92,11 +94,13 @@ def change_campaign(
     session: WriteSession,
     services: UseServices,
 ) -> CampaignOut:
-    """Rename, archive, or change settings (partly)."""
+    """Rename, archive, or change settings (partly); the publish rule as an admin only."""
     settings = None
     if body.settings is not None:
-        before = campaigns.get_campaign(session, campaign_id).settings
+        # Locked before they are read: what somebody else changes meanwhile is kept.
+        before = lock_campaign(session, campaign_id).settings
         settings = _merge_settings(before, body.settings)
+        _refuse_another_rule(before["publish_rule"], settings["publish_rule"], me)
     campaign = campaigns.change_campaign(
         session,
         services.clock(),
@@ -108,6 +112,15 @@ def change_campaign(
         by=me.id,
     )
     return CampaignOut.model_validate(campaign)
+
+
+def _refuse_another_rule(before: str, after: str, me: Me) -> None:
+    """Publishing is for admins, and so is the rule by which rounds publish."""
+    if after != before and me.role != Role.ADMIN:
+        raise NotAllowedError(
+            f"publish_rule {after!r} instead of {before!r} needs role 'admin';"
+            f" {me.name!r} has {me.role.value!r}"
+        )
 
 
 def _merge_settings(before: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
@@ -173,7 +186,12 @@ def rollback(
 ) -> PublicationOut:
     """Publish again what was published before."""
     moved = publications.rollback(
-        session, services.clock(), campaign_id=campaign_id, reason=body.reason, by=me.id
+        session,
+        services.clock(),
+        campaign_id=campaign_id,
+        checkpoint_id=body.checkpoint_id,
+        reason=body.reason,
+        by=me.id,
     )
     return PublicationOut.model_validate(moved)
 

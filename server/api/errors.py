@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import reprlib
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -38,6 +40,9 @@ STATUS_OF: dict[type[RodifError], HTTPStatus] = {
     DatabaseVersionError: HTTPStatus.SERVICE_UNAVAILABLE,
 }
 PROBLEM_TYPE = "application/problem+json"
+_SECRET = ("password", "token", "cookie", "authorization")  # parts of names of secret fields
+_short = reprlib.Repr()
+_short.maxstring = _short.maxlong = _short.maxother = 60  # characters of a value in a message
 
 
 def problem(
@@ -108,13 +113,27 @@ def _rodif_error(_request: Request, error: Exception) -> JSONResponse:
 def _validation_error(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     found = [
-        {"field": ".".join(str(part) for part in item["loc"]), "message": item["msg"]}
+        {"field": ".".join(str(part) for part in item["loc"]), "message": _message(item)}
         for item in error.errors()
     ]
     if any(item["type"] == "json_invalid" for item in error.errors()):
         return problem(HTTPStatus.BAD_REQUEST, "the body is not JSON", errors=found)
     fields = "; ".join(f"{item['field']}: {item['message']}" for item in found)
     return problem(HTTPStatus.UNPROCESSABLE_ENTITY, fields, errors=found)
+
+
+def _message(item: Mapping[str, Any]) -> str:
+    """What is legal, and what was given, unless that is secret or may hold something secret.
+
+    So no whole bodies, objects and lists are shown, and nothing of an unknown field: its name may
+    be that of a password, misspelt.
+    """
+    place, given, message = item["loc"], item.get("input"), str(item["msg"])
+    secret = any(word in str(part).lower() for part in place for word in _SECRET)
+    unnamed = item["type"] in ("missing", "extra_forbidden", "json_invalid")
+    if secret or unnamed or len(place) < 2 or isinstance(given, dict | list):
+        return message
+    return f"{message} (given: {_short.repr(given)})"
 
 
 def http_error(_request: Request, error: Exception) -> JSONResponse:

@@ -24,7 +24,7 @@ from server.schemas.rounds import (
     RoundCreate,
     RoundOut,
 )
-from server.states import JobState
+from server.states import JobState, Role
 from server.store.paging import page
 from server.store.tables import Checkpoint, Event, Job, LabelSnapshot, Round
 
@@ -46,13 +46,13 @@ def _without_paths(result: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _rounds_out(session: Session, rows: Sequence[Round]) -> list[RoundOut]:
-    candidates: dict[int | None, int] = dict(
-        session.execute(
-            select(Checkpoint.round_id, Checkpoint.id).where(
-                Checkpoint.round_id.in_([row.id for row in rows])
-            )
-        ).all()
+    stopped = Checkpoint.metrics[("finetune", "stopped")].as_string()
+    made = session.execute(
+        select(Checkpoint.round_id, Checkpoint.id, stopped).where(
+            Checkpoint.round_id.in_([row.id for row in rows])
+        )
     )
+    candidates = {round_id: (candidate_id, why) for round_id, candidate_id, why in made}
     sizes = dict(
         session.execute(
             select(LabelSnapshot.digest, LabelSnapshot.size).where(
@@ -60,16 +60,17 @@ def _rounds_out(session: Session, rows: Sequence[Round]) -> list[RoundOut]:
             )
         ).all()
     )
-    extra = ("candidate_checkpoint_id", "labels")
+    extra = ("candidate_checkpoint_id", "labels", "stopped")
     names = [name for name in RoundOut.model_fields if name not in extra]
-    return [
-        RoundOut(
-            candidate_checkpoint_id=candidates.get(row.id),
-            labels=sizes[row.snapshot_digest],
-            **{name: getattr(row, name) for name in names},
+    shown = []
+    for row in rows:
+        candidate_id, why = candidates.get(row.id, (None, None))
+        own = {name: getattr(row, name) for name in names}
+        labels = sizes[row.snapshot_digest]
+        shown.append(
+            RoundOut(candidate_checkpoint_id=candidate_id, stopped=why, labels=labels, **own)
         )
-        for row in rows
-    ]
+    return shown
 
 
 def _round_out(session: Session, row: Round) -> RoundOut:
@@ -128,6 +129,7 @@ def launch_round(
             seed=body.seed,
         ),
         started_by=me.id,
+        may_loosen=me.role == Role.ADMIN,
     )
     response.headers["Location"] = f"/api/v1/rounds/{started.id}"
     return _round_out(session, started)

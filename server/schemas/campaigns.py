@@ -148,8 +148,9 @@ class PublishRequest(In):
 
 
 class RollbackRequest(In):
-    """Why."""
+    """Why, and the checkpoint that is expected to be published by it."""
 
+    checkpoint_id: Id | None = None
     reason: LongText = ""
 
 

@@ -35,7 +35,8 @@ class RoundCreate(In):
 
 
 class RoundOut(Out):
-    """A round; `labels` is the size of its snapshot. In lists `result` has no paths."""
+    """A round; `labels` is the size of its snapshot, `stopped` why a literal method made no more
+    updates. In lists `result` has no paths."""
 
     id: int
     campaign_id: int
@@ -49,6 +50,7 @@ class RoundOut(Out):
     snapshot_digest: str
     labels: int
     noise: dict[str, Any] | None
+    stopped: str | None
     result: dict[str, Any] | None
     error: str | None
     created_at: datetime

@@ -183,12 +183,7 @@ def fail(session: Session, now: datetime, claim: Claim, error: str, *, retry: bo
 def _change(session: Session, claim: Claim, values: dict[str, Any]) -> None:
     statement = (
         update(Job)
-        .where(
-            Job.id == claim.job_id,
-            Job.attempt == claim.attempt,
-            Job.owner == claim.owner,
-            Job.state == JobState.RUNNING,
-        )
+        .where(_holds(claim))
         .values(**values)
         .returning(Job.id)
         .execution_options(synchronize_session=False)
@@ -201,6 +196,44 @@ def _change(session: Session, claim: Claim, values: dict[str, Any]) -> None:
     job = session.get(Job, claim.job_id)
     if job is not None:
         session.refresh(job)
+
+
+def _holds(claim: Claim) -> ColumnElement[bool]:
+    return and_(
+        Job.id == claim.job_id,
+        Job.attempt == claim.attempt,
+        Job.owner == claim.owner,
+        Job.state == JobState.RUNNING,
+    )
+
+
+def running_claims(session: Session) -> list[Claim]:
+    """The claims that hold now, also those whose lease has run out."""
+    query = select(Job.id, Job.attempt, Job.owner).where(Job.state == JobState.RUNNING)
+    rows = session.execute(query.order_by(Job.id))
+    return [Claim(job_id, attempt, owner) for job_id, attempt, owner in rows if owner is not None]
+
+
+def hand_back(session: Session, claim: Claim) -> bool:
+    """Queue the job of a worker that was stopped on purpose; False when the claim is gone.
+
+    One more attempt is allowed in place of the interrupted one. Its number stays used, so that the
+    claim can never become valid again. The next tick sends the job.
+    """
+    statement = (
+        update(Job)
+        .where(_holds(claim))
+        .values(
+            state=JobState.QUEUED,
+            max_attempts=Job.max_attempts + 1,
+            lease_expires_at=None,
+            owner=None,
+            sent_at=None,
+        )
+        .returning(Job.id)
+        .execution_options(synchronize_session=False)
+    )
+    return session.execute(statement).scalar_one_or_none() is not None
 
 
 def stuck_jobs(

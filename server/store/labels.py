@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, Row, func, select
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
 
 from server.errors import NotFoundError
-from server.states import DECISIVE
+from server.states import DECISIVE, TELLING
 from server.store.tables import Label, LabelSnapshot
 
 _Newer = aliased(Label)
@@ -37,6 +37,14 @@ def count_effective(session: Session, campaign_id: int) -> int:
     """Number of labels that hold now."""
     query = select(func.count()).where(Label.campaign_id == campaign_id, is_effective())
     return session.execute(query).scalar_one()
+
+
+def telling_label_ids(session: Session, campaign_id: int) -> list[int]:
+    """Ids of the labels that hold now and that a round learns from, ascending."""
+    query = select(Label.id).where(
+        Label.campaign_id == campaign_id, Label.choice.in_(TELLING), is_effective()
+    )
+    return list(session.scalars(query.order_by(Label.id)))
 
 
 def has_decisive_label(session: Session, campaign_id: int) -> bool:

@@ -1,4 +1,4 @@
-"""`rodif up` as a person runs it: first start, a second one beside it, stop, start again."""
+"""`rodif up` as a person runs it: starts, a second one beside it, stops, also amid work."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.acceptance.system import wait_for
+from server.states import JobState
+from server.store.tables import Episode, Job
+from tests.acceptance.system import running_site, wait_for
 from worker.cli.client import Client
 
 pytestmark = pytest.mark.slow
@@ -81,3 +83,18 @@ def test_up_starts_signs_in_refuses_a_second_one_stops_cleanly_and_starts_again(
             assert api.find_campaign(None)["id"] == campaign["id"]
         process.send_signal(signal.SIGINT)  # Ctrl-C
         assert process.wait(timeout=120) == 0
+
+
+def test_stop_in_the_middle_of_a_job_costs_it_no_attempt(tmp_path: Path) -> None:
+    with running_site(tmp_path) as site:
+        collect = {"episodes": 60, "pairs": 1, "strategy": "random"}
+        job_id = site.post("/collect", collect)["id"]
+        wait_for(lambda: len(site.rows(Episode)) > 0, "the first episodes are stored")
+        (begun,) = site.rows(Job, id=job_id)
+        assert begun.state == JobState.RUNNING, "stopped too late for this test"
+    (stopped,) = site.rows(Job, id=job_id)
+    assert (stopped.state, stopped.owner) == (JobState.QUEUED, None)
+    assert stopped.max_attempts - stopped.attempt == begun.max_attempts
+    with running_site(tmp_path) as site:
+        site.api.wait_for_job(job_id, seconds=180)
+        assert sorted(episode.seed for episode in site.rows(Episode)) == list(range(60))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from rodif_core.errors import RodifError, ValueOutOfRangeError
 from server.store.tables import Episode, Label, Pair, SimulatedTruth
 from tests.cli.running_api import RunningApi
+from worker.cli.main import main
 from worker.cli.simulate import SimulationConfig, simulate, true_choice, utility
 
 GOOD, FAILED, OTHER = (True, "left"), (False, "left"), (True, "right")
@@ -92,6 +94,20 @@ def test_no_pair_is_labelled_twice_and_a_second_call_gives_the_rest(api: Running
     assert (second.total, second.flipped) == (14, 14)
     pairs = Counter(label.pair_id for label, _, _ in rows_of(api, campaign))
     assert max(pairs.values()) == 1
+
+
+def test_command_fails_when_it_gave_fewer_labels_than_asked_for(
+    api: RunningApi, capsys: pytest.CaptureFixture[str]
+):
+    campaign = api.make_campaign(OUTCOMES, "too few")  # 39 pairs can be told apart
+    where = ["--url", api.url, "--token", api.token, "--campaign", str(campaign["id"]), "--json"]
+    assert main(["simulate", *where, "--labels", "30"]) == 0
+    told = capsys.readouterr()
+    assert (json.loads(told.out)["total"], told.err) == (30, "")
+    assert main(["simulate", *where, "--labels", "10"]) == 1
+    told = capsys.readouterr()
+    assert json.loads(told.out)["total"] == 9
+    assert "fewer than the 10 asked for: collect more pairs first" in told.err
 
 
 def test_durations_look_like_a_persons(api: RunningApi):

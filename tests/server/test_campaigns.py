@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 from sqlalchemy import select
 
 from server.states import Choice, JobKind, JobState
+from server.store.campaigns import lock_campaign
 from server.store.tables import Job
 from tests import factories
 from tests.server.threads import at_once
@@ -122,6 +124,37 @@ def test_settings_change_partly_and_are_checked(world: World) -> None:
     assert taken.status_code == 409
 
 
+def test_the_publish_rule_is_changed_by_admins_only(sqlite_world: World) -> None:
+    campaign_id, _ = sqlite_world.add_campaign(publish_rule="manual")
+    script, path = sqlite_world.client("sam"), f"/campaigns/{campaign_id}"
+    for rule in ("auto", "never"):
+        answer = script.patch(path, json={"name": "x", "settings": {"publish_rule": rule}})
+        assert answer.status_code == 403
+        assert answer.json()["detail"] == (
+            f"publish_rule '{rule}' instead of 'manual' needs role 'admin'; 'sam' has 'service'"
+        )
+    same = {"settings": {"publish_rule": "manual", "round_after_labels": 5}}
+    kept = script.patch(path, json=same).json()
+    assert (kept["name"], kept["settings"]["round_after_labels"]) == ("campaign 0", 5)
+    changed = sqlite_world.client("ada").patch(path, json={"settings": {"publish_rule": "auto"}})
+    assert changed.json()["settings"]["publish_rule"] == "auto"
+
+
+def test_settings_that_two_change_at_once_are_both_kept(world: World) -> None:
+    campaign_id, _ = world.add_campaign()
+    admin, path = world.client("ada"), f"/campaigns/{campaign_id}"
+    with ThreadPoolExecutor(1) as pool:
+        with world.database.write() as session:
+            campaign = lock_campaign(session, campaign_id)
+            campaign.settings = campaign.settings | {"labels_per_pair": 2}
+            session.flush()
+            other = pool.submit(lambda: admin.patch(path, json={"settings": {"method": "rodif"}}))
+            with pytest.raises(TimeoutError):
+                other.result(timeout=0.5)  # what it merges into is not known before
+        answer = other.result(timeout=30)
+    assert answer.json()["settings"] == DEFAULTS | {"labels_per_pair": 2, "method": "rodif"}
+
+
 def test_the_criterion_cannot_change_under_given_labels(world: World) -> None:
     campaign_id, (pair_id,) = world.add_campaign(pairs=1)
     admin, path = world.client("ada"), f"/campaigns/{campaign_id}"
@@ -180,6 +213,25 @@ def test_collecting_queues_a_job_and_tells_where_to_follow_it(world: World) -> N
     assert (found["kind"], found["state"], found["progress"]) == ("collect", "queued", 0.0)
 
 
+@pytest.mark.parametrize(
+    ("asked", "pairs"),
+    [
+        ({"episodes": 10}, 45),  # 10 · 9 / 2
+        ({"episodes": 18}, 150),  # of 153; the campaign's number
+        ({}, 150),
+        ({"episodes": 10, "pairs": 45}, 45),
+    ],
+)
+def test_collecting_few_episodes_makes_the_pairs_that_there_are(
+    sqlite_world: World, asked: dict[str, int], pairs: int
+) -> None:
+    campaign_id, _ = sqlite_world.add_campaign()
+    answer = sqlite_world.client("ada").post(f"/campaigns/{campaign_id}/collect", json=asked)
+    assert answer.status_code == 202
+    with sqlite_world.database.read() as session:
+        assert session.get_one(Job, answer.json()["id"]).payload["pairs"] == pairs
+
+
 def test_collects_never_plan_the_same_seeds_even_at_once(world: World) -> None:
     campaign_id, _ = world.add_campaign()
     path = f"/campaigns/{campaign_id}/collect"
@@ -194,7 +246,8 @@ def test_collects_never_plan_the_same_seeds_even_at_once(world: World) -> None:
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ({"episodes": 3, "pairs": 4}, "pairs is 4, but must be at most 3"),
+        ({"episodes": 3, "pairs": 4}, "pairs is 4, but must be at most 3, the pairs of 3 episodes"),
+        ({"pairs": 1771}, "pairs is 1771, but must be at most 1770, the pairs of 60 episodes"),
         ({"episodes": 1}, "greater than or equal to 2"),
         ({"random_share": 1.5}, "less than or equal to 1"),
         ({"random_share": "0.5"}, "valid number"),

@@ -77,7 +77,8 @@ def _end(database: Database, round_id: int, state: RoundState, minutes: float = 
 
 def _new_labels(database: Database, campaign_id: int) -> int:
     with database.read() as session:
-        return new_labels_since_round(session, campaign_id)
+        campaign = session.get_one(factories.Campaign, campaign_id)
+        return new_labels_since_round(session, campaign)
 
 
 @pytest.mark.parametrize("state", [RoundState.FAILED, RoundState.CANCELLED])
@@ -201,6 +202,62 @@ def test_comparison_rounds_do_not_count_as_learning(database: Database) -> None:
     assert _due(database, campaign_id) is RoundTrigger.LABELS
 
 
+def test_a_campaign_that_only_compares_starts_one_round_for_each_set_of_new_labels(
+    database: Database,
+) -> None:
+    campaign_id = _campaign(database, round_after_labels=2, publish_rule="never")
+    for labels in (slice(0, 2), slice(2, 4)):
+        with database.write() as session:
+            _add_labels(session, campaign_id, labels)
+        assert _due(database, campaign_id) is RoundTrigger.LABELS
+        with database.write() as session:
+            started = rounds.launch_due(session, NOW, campaign_id)
+            assert started is not None and started.publish_rule == PublishRule.NEVER
+        assert _due(database, campaign_id) is None  # it runs
+        _end(database, started.id, RoundState.KEPT)
+        assert _due(database, campaign_id, minutes=10_000) is None  # nothing new
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(4, 5))
+    assert _due(database, campaign_id, minutes=10_000) is None  # one new label of two
+
+
+def test_a_campaign_that_only_compares_waits_its_minutes_and_rests_after_a_failure(
+    database: Database,
+) -> None:
+    campaign_id = _campaign(database, round_every_minutes=30.0, publish_rule="never")
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+        at = NOW + timedelta(minutes=30)
+        failed = rounds.launch_due(session, at, campaign_id)
+        assert failed is not None
+    _end(database, failed.id, RoundState.FAILED, minutes=55)
+    assert _due(database, campaign_id, minutes=64.9) is None  # the rest after a failure
+    assert _due(database, campaign_id, minutes=65) is RoundTrigger.PERIODIC
+    with database.write() as session:
+        again = rounds.launch_due(session, NOW + timedelta(minutes=65), campaign_id)
+        assert again is not None
+        _add_labels(session, campaign_id, slice(2, 3))
+    assert _due(database, campaign_id, minutes=100) is None  # it runs
+    _end(database, again.id, RoundState.KEPT, minutes=66)
+    assert _due(database, campaign_id, minutes=94.9) is None
+    assert _due(database, campaign_id, minutes=95) is RoundTrigger.PERIODIC
+
+
+def test_labels_of_comparisons_are_new_once_the_campaign_publishes(database: Database) -> None:
+    campaign_id = _campaign(database, round_after_labels=2, publish_rule="never")
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+        compared = rounds.launch_due(session, NOW, campaign_id)
+        assert compared is not None
+    _end(database, compared.id, RoundState.KEPT)
+    assert _new_labels(database, campaign_id) == 0
+    with database.write() as session:
+        campaign = session.get_one(factories.Campaign, campaign_id)
+        campaign.settings = campaign.settings | {"publish_rule": "auto"}
+    assert _new_labels(database, campaign_id) == 2
+    assert _due(database, campaign_id) is RoundTrigger.LABELS
+
+
 def test_labels_that_say_nothing_start_no_round(database: Database) -> None:
     campaign_id = _campaign(database, round_after_labels=1)
     with database.write() as session:
@@ -212,6 +269,26 @@ def test_labels_that_say_nothing_start_no_round(database: Database) -> None:
         assert rounds.due_campaign_ids(session, NOW) == []
         assert session.scalars(select(Round)).all() == []
         assert session.scalars(select(LabelSnapshot)).all() == []
+
+
+@pytest.mark.parametrize(
+    ("choice", "due"),
+    [
+        (Choice.SECOND, RoundTrigger.LABELS),
+        (Choice.EQUAL, RoundTrigger.LABELS),
+        (Choice.CANNOT_TELL, None),
+    ],
+)
+def test_labels_from_which_nothing_is_learned_are_not_new(
+    database: Database, choice: Choice, due: RoundTrigger | None
+) -> None:
+    campaign_id = _campaign(database, round_after_labels=3)
+    with database.write() as session:
+        _add_labels(session, campaign_id, slice(0, 2))
+        third = session.scalars(select(Pair).order_by(Pair.id)).all()[2]
+        factories.add_label(session, third, 1, choice)
+    assert _new_labels(database, campaign_id) == (2 if due is None else 3)
+    assert _due(database, campaign_id) is due
 
 
 def test_two_ticks_at_once_start_one_round(database: Database) -> None:

@@ -174,6 +174,30 @@ def test_a_job_that_kills_every_worker_is_given_up(database: Database) -> None:
         assert "died in every one" in str(given_up[0].error)
 
 
+def test_a_job_of_a_stopped_worker_goes_back_without_losing_an_attempt(database: Database) -> None:
+    with database.write() as session:
+        job_id = _enqueue(session, max_attempts=2).id
+    for cycle in range(4):
+        claim = _must(_claim(database, job_id, f"w{cycle}"))
+        with database.write() as session:
+            assert jobs.running_claims(session) == [claim]
+            assert jobs.hand_back(session, claim)
+            assert not jobs.hand_back(session, claim)  # it is gone
+            assert jobs.running_claims(session) == []
+        with pytest.raises(LeaseLostError), database.write() as session:
+            jobs.finish(session, NOW, claim, {})
+        with database.write() as session:
+            sent = jobs.stuck_jobs(session, NOW, patience=LEASE, busy_kinds=[JobKind.COLLECT])
+            assert sent == [(job_id, JobKind.COLLECT)]  # at once
+            assert jobs.give_up_exhausted(session, NOW) == []
+    for _ in range(2):  # attempts that die count as ever
+        now = _get(database, job_id).lease_expires_at or NOW
+        _must(_claim(database, job_id, "dying", now + timedelta(seconds=1)))
+    with database.write() as session:
+        given_up = jobs.give_up_exhausted(session, NOW + 10 * LEASE)
+        assert [job.id for job in given_up] == [job_id]
+
+
 def test_stuck_jobs_are_queued_or_expired_ones_sent_long_ago(database: Database) -> None:
     with database.write() as session:
         campaign = factories.add_campaign(session)

@@ -27,9 +27,9 @@ def _publish(world: World, campaign_id: int, checkpoint_id: int) -> Any:
     return world.client("ada").post(f"/campaigns/{campaign_id}/publish", json=body)
 
 
-def _roll_back(world: World, campaign_id: int) -> Any:
+def _roll_back(world: World, campaign_id: int, **expected: int) -> Any:
     path = f"/campaigns/{campaign_id}/rollback"
-    return world.client("ada").post(path, json={"reason": "worse"})
+    return world.client("ada").post(path, json={"reason": "worse"} | expected)
 
 
 @pytest.fixture
@@ -65,6 +65,28 @@ def test_publishing_and_rolling_back_walk_through_the_history(
         ("publish", 3),
     ]
     assert {row["by_annotator_id"] for row in history} == {world.ids["ada"]}
+
+
+def test_a_rollback_to_another_checkpoint_than_expected_is_refused(
+    world: World, campaign_id: int
+) -> None:
+    _publish(world, campaign_id, 2)
+    _publish(world, campaign_id, 3)  # after somebody looked
+    refused = _roll_back(world, campaign_id, checkpoint_id=1)
+    assert refused.status_code == 409
+    assert "would now publish checkpoint 2, not 1" in refused.json()["detail"]
+    assert _published(world, campaign_id) == 3
+    assert _roll_back(world, campaign_id, checkpoint_id=2).json()["checkpoint_id"] == 2
+
+
+def test_of_two_rollbacks_at_once_that_expect_the_same_one_is_refused(
+    world: World, campaign_id: int
+) -> None:
+    _publish(world, campaign_id, 2)
+    _publish(world, campaign_id, 3)
+    answers = at_once([lambda: _roll_back(world, campaign_id, checkpoint_id=2)] * 3)
+    assert sorted(answer.status_code for answer in answers) == [201, 409, 409]
+    assert _published(world, campaign_id) == 2
 
 
 def test_every_move_is_audited_and_told(world: World, campaign_id: int) -> None:

@@ -146,6 +146,32 @@ def test_a_second_publishing_round_is_refused_while_one_runs(world: World) -> No
     assert _launch(world, campaign_id).status_code == 202
 
 
+@pytest.mark.parametrize(
+    ("usual", "legal"),
+    [
+        ("auto", ["auto", "manual", "never"]),
+        ("manual", ["manual", "never"]),
+        ("never", ["never"]),
+    ],
+)
+@pytest.mark.parametrize("wanted", ["auto", "manual", "never"])
+def test_only_admins_start_rounds_that_publish_more_easily_than_the_campaign_says(
+    sqlite_world: World, usual: str, legal: list[str], wanted: str
+) -> None:
+    campaign_id = _labelled(sqlite_world, publish_rule=usual)
+    path = f"/campaigns/{campaign_id}/rounds"
+    answer = sqlite_world.client("sam").post(path, json={"publish_rule": wanted})
+    if wanted in legal:
+        assert (answer.status_code, answer.json()["publish_rule"]) == (202, wanted)
+        return
+    assert answer.status_code == 403
+    told = answer.json()["detail"]
+    assert f"publish_rule '{wanted}' is looser than '{usual}' of campaign {campaign_id}" in told
+    assert told.endswith("legal values are " + ", ".join(f"'{rule}'" for rule in legal))
+    assert sqlite_world.sent == []
+    assert _launch(sqlite_world, campaign_id, publish_rule=wanted).status_code == 202
+
+
 def test_of_many_launches_at_once_one_wins(world: World) -> None:
     campaign_id = _labelled(world)
     answers = at_once([lambda: _launch(world, campaign_id)] * 4)
@@ -351,6 +377,29 @@ def test_curves_are_the_points_of_the_round_in_order(world: World) -> None:
     points = world.client("sam").get(f"/rounds/{round_id}/curves").json()
     assert [point["step"] for point in points] == [0, 1, 2]
     assert points[1] == {"stage": "score", "step": 1, "loss": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("metrics", "told"),
+    [
+        ({"finetune": {"stopped": "the gate shut at update 0", "curve": []}}, "the gate shut at"),
+        ({"finetune": {"chosen": {}}}, None),
+        ({}, None),
+    ],
+)
+def test_a_round_tells_why_its_fine_tuning_stopped(
+    world: World, metrics: dict[str, Any], told: str | None
+) -> None:
+    campaign_id = _labelled(world)
+    round_id = _launch(world, campaign_id).json()["id"]
+    client = world.client("sam")
+    assert client.get(f"/rounds/{round_id}").json()["stopped"] is None  # it goes on
+    with world.database.write() as session:
+        made = factories.add_checkpoint(session, "candidate", parent_id=1, round_id=round_id)
+        made.metrics = metrics
+    one = client.get(f"/rounds/{round_id}").json()
+    assert one["stopped"] is None if told is None else one["stopped"].startswith(told)
+    assert client.get(f"/campaigns/{campaign_id}/rounds").json()["items"] == [one]
 
 
 def test_rounds_are_listed_newest_first_without_what_their_evaluations_draw(world: World) -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 import schemathesis
@@ -113,6 +114,57 @@ def test_json_that_no_database_takes_is_refused(
     answer = sqlite_world.client("ada").post(path, content=body, headers=headers)
     assert answer.status_code == 422
     assert words in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "told"),
+    [
+        ("/campaigns/1/collect", {"episodes": 1}, "or equal to 2 (given: 1)"),
+        ("/campaigns/1/collect", {"strategy": "best"}, "'random' (given: 'best')"),
+        ("/campaigns/1/collect", {"random_share": True}, "valid number (given: True)"),
+        ("/campaigns", {"name": "", "task": "avoid"}, "1 character (given: '')"),
+        ("/campaigns/1/rounds", {"evaluation": {"episodes": 9}}, "or equal to 10 (given: 9)"),
+    ],
+)
+def test_a_wrong_field_names_its_value_and_the_legal_ones(
+    sqlite_world: World, path: str, body: dict[str, Any], told: str
+) -> None:
+    sqlite_world.add_campaign()
+    answer = sqlite_world.client("ada").post(path, json=body)
+    assert answer.status_code == 422
+    assert told in answer.json()["detail"] and told in answer.json()["errors"][0]["message"]
+
+
+def test_a_wrong_field_of_settings_or_of_the_address_names_its_value(sqlite_world: World) -> None:
+    sqlite_world.add_campaign()
+    client = sqlite_world.client("ada")
+    partly = client.patch("/campaigns/1", json={"settings": {"collect": {"pairs": 0}}})
+    assert "or equal to 1 (given: 0)" in partly.json()["detail"]
+    assert "(given: 'one')" in client.get("/campaigns/one").json()["detail"]
+    assert "(given: '5000')" in client.get("/campaigns/1/rounds?limit=5000").json()["detail"]
+    long = client.post("/campaigns", json={"name": "x" * 500, "task": "avoid"}).json()["detail"]
+    assert len(long) < 200 and "(given: 'xxx" in long
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body"),
+    [
+        ("POST", "/annotators", {"name": "eve", "role": "annotator", "password": "hunter2"}),
+        ("PATCH", "/annotators/4", {"password": "hunter2"}),
+        ("POST", "/session", {"name": "eve", "passwort": "hunter2"}),
+        ("POST", "/session", {"password": "hunter2"}),
+        ("POST", "/session", {"name": {"password": "hunter2"}, "password": "hunter2"}),
+        ("POST", "/session", "hunter2"),
+        ("POST", "/session", ["hunter2"]),
+        ("DELETE", "/tokens/hunter2", None),
+    ],
+)
+def test_what_is_secret_or_may_be_is_not_repeated(
+    sqlite_world: World, method: str, path: str, body: Any
+) -> None:
+    answer = sqlite_world.client("ada").request(method, path, json=body)
+    assert answer.status_code == 422
+    assert answer.json()["errors"] and "hunter2" not in answer.text
 
 
 def test_a_huge_body_is_refused(sqlite_world: World) -> None:

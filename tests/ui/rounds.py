@@ -91,9 +91,12 @@ class WorkerStandIn:
             told = {"job_id": self.job_id, "kind": "finetune", "progress": fraction, "stage": stage}
             add_event(session, now, kind="job", data=told, **where)
 
-    def finish(self, before: dict[str, Any], after: dict[str, Any]) -> int:
-        """Candidate, evaluation, gate, and publication unless it is a comparison round; returns
-        the candidate's id."""
+    def finish(
+        self, before: dict[str, Any], after: dict[str, Any], *, unchanged: str | None = None
+    ) -> int:
+        """Candidate, evaluation, gate, and publication if the round's rule is "auto"; returns the
+        candidate's id. `unchanged`: why the candidate has its parent's weights, so that it is kept.
+        """
         now = datetime.now(UTC)
         with self.studio.database.write() as session:
             this = session.get_one(Round, self.round_id)
@@ -107,7 +110,7 @@ class WorkerStandIn:
                 round_id=self.round_id,
                 snapshot_digest=this.snapshot_digest,
                 config=dict(parent.config),
-                metrics={},
+                metrics={"finetune": {"stopped": unchanged}} if unchanged else {},
                 code_version="test",
                 created_at=now,
             )
@@ -118,12 +121,12 @@ class WorkerStandIn:
                 "source": "estimated",
                 "estimates": {"overlap": 0.25},
             }
-            gate = {"passed": True, "reasons": ["success kept", "on the data"]}
+            gate = {"passed": True, "unchanged": bool(unchanged), "reasons": ["success kept"]}
             this.result = {"before": before, "after": after, "gate": gate}
             for state in (RoundState.EVALUATING, RoundState.GATING):
                 rounds.move(session, now, self.round_id, state)
             session.get_one(Job, self.job_id).state = "done"
-            if this.publish_rule == PublishRule.NEVER:
+            if unchanged or this.publish_rule != PublishRule.AUTO:
                 rounds.move(session, now, self.round_id, RoundState.KEPT)
                 return candidate.id
             publications.publish(

@@ -39,6 +39,29 @@ def test_token_made_on_the_page_opens_the_api_until_it_is_revoked(
     assert refused.value.status == 401
 
 
+def test_password_with_spaces_around_it_signs_in_as_it_was_typed(
+    studio: Studio, page: Page
+) -> None:
+    sign_in(page, studio, "admin", "/admin")
+    name, passwords = studio.new_name("spaced"), ("  first one ", " second one  ")
+    page.get_by_role("button", name="New account").click()
+    page.get_by_label("Name").fill(f" {name} ")
+    page.get_by_role("dialog").get_by_label("Password").fill(passwords[0])
+    page.get_by_role("button", name="Create").click()
+    row = page.locator("#people tr", has_text=name)
+    row.get_by_role("button", name="Password").wait_for()
+    with Client(studio.url) as person:
+        person.sign_in(name, passwords[0])
+    row.get_by_role("button", name="Password").click()
+    page.get_by_role("dialog").get_by_label("Password").fill(passwords[1])
+    page.get_by_role("button", name="Set password").click()
+    page.get_by_role("dialog").wait_for(state="detached")
+    with Client(studio.url) as person:
+        person.sign_in(name, passwords[1])
+        with pytest.raises(ApiError):
+            person.sign_in(name, passwords[1].strip())
+
+
 def test_another_task_proposes_its_own_criterion_unless_one_was_written(
     studio: Studio, page: Page
 ) -> None:

@@ -234,6 +234,20 @@ def test_settings_are_changed_in_the_dialog(studio: Studio, page: Page) -> None:
     assert row.settings["round_after_labels"] == 40
 
 
+def test_settings_that_another_admin_changes_meanwhile_are_kept(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("Start a round by itself").fill("40")
+    with studio.database.write() as session:
+        row = session.get_one(Campaign, campaign)
+        row.settings = row.settings | {"publish_rule": "manual", "labels_per_pair": 3}
+        expected = row.settings | {"round_after_labels": 40}
+    confirm(page, "Save")
+    with studio.database.read() as session:
+        assert session.get_one(Campaign, campaign).settings == expected
+
+
 def test_settings_are_stored_beside_a_criterion_that_ends_in_a_new_line(
     studio: Studio, page: Page
 ) -> None:
@@ -364,11 +378,63 @@ def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
     shown.get_by_text("comparison", exact=True).wait_for()
     assert shown.get_by_role("button", name="Publish").count() == 0
     page.get_by_role("button", name="Roll back").click()
+    page.get_by_role("dialog", name=f"Roll back to {second.name}?").wait_for()
     confirm(page, "Roll back")
     page.locator(f'[data-checkpoint="{second.id}"]').get_by_text("published").wait_for()
     page.get_by_role("button", name="Roll back").click()
-    confirm(page, "Roll back")
+    dialog = page.get_by_role("dialog", name="Roll back to avoid-pretrained?")
+    with studio.database.write() as session:  # somebody else is quicker
+        publications.publish(
+            session, now, campaign_id=campaign, checkpoint_id=start, reason="", by=None
+        )
+    dialog.get_by_role("button", name="Roll back").click()
+    refusal = f"would now publish checkpoint {second.id}, not {start}"
+    dialog.get_by_role("alert").get_by_text(refusal).wait_for()
+    dialog.get_by_role("button", name="Cancel").click()
+    page.locator(f'[data-checkpoint="{start}"]').get_by_text("published").wait_for()
+    for target in (second.id, start):
+        page.get_by_role("button", name="Roll back").click()
+        confirm(page, "Roll back")
+        page.locator(f'[data-checkpoint="{target}"]').get_by_text("published").wait_for()
     page.locator("#rollback:disabled").wait_for()
+
+
+@pytest.mark.parametrize(
+    ("rule", "told"),
+    [
+        (PublishRule.NEVER, "The gate passed · for comparison, never published"),
+        (PublishRule.MANUAL, "The gate passed · kept for an admin to publish"),
+    ],
+)
+def test_page_says_of_a_kept_candidate_whether_it_can_be_published(
+    studio: Studio, page: Page, rule: PublishRule, told: str
+) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    with studio.database.write() as session:
+        request = rounds.RoundRequest(publish_rule=rule)
+        this = rounds.launch(session, datetime.now(UTC), campaign, request).id
+    worker = WorkerStandIn(studio, this)
+    worker.start()
+    candidate = worker.finish(evaluation(22, 70, 8), evaluation(91, 3, 6))
+    open_campaign(page, studio, campaign)
+    page.locator("#behaviour .gate").get_by_text(told).wait_for()
+    offered = page.locator(f'[data-checkpoint="{candidate}"]').get_by_role("button", name="Publish")
+    assert offered.count() == (0 if rule is PublishRule.NEVER else 1)
+
+
+def test_page_says_why_a_round_learned_nothing(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    with studio.database.write() as session:
+        this = rounds.launch(session, datetime.now(UTC), campaign, rounds.RoundRequest()).id
+    worker, same = WorkerStandIn(studio, this), evaluation(22, 70, 8)
+    worker.start()
+    worker.finish(same, same, unchanged="dead gradient: use a conservativeness below 0.5")
+    open_campaign(page, studio, campaign)
+    said = page.locator("#behaviour .gate")
+    said.get_by_text("The gate passed · not published, nothing was learned").wait_for()
+    said.get_by_text("Fine-tuning: dead gradient: use a conservativeness below 0.5").wait_for()
 
 
 def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Page) -> None:

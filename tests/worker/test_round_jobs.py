@@ -203,6 +203,25 @@ def test_gate_decides_by_rates_and_rule(
     assert [row.action for row in world.rows(Publication)] == (["publish"] if moved else [])
 
 
+@pytest.mark.parametrize("rule", [PublishRule.AUTO, PublishRule.MANUAL])
+def test_candidate_that_has_its_parents_weights_is_kept_with_the_reason(
+    world: World, rule: PublishRule
+) -> None:
+    round_id = world.launch(rule, conservativeness=0.9)  # shuts the gate before the first update
+    for kind in (JobKind.FINETUNE, JobKind.EVALUATE, JobKind.PUBLISH):
+        assert _run(world, kind, round_id) == JobState.DONE
+    (candidate,) = _candidates(world)
+    assert candidate.digest == world.rows(Checkpoint)[0].digest
+    row = _round(world, round_id)
+    assert row.state == RoundState.KEPT
+    gate = row.result["gate"]
+    stopped = candidate.metrics["finetune"]["stopped"]
+    assert (gate["passed"], gate["unchanged"]) == (True, True)
+    assert gate["reasons"][-1] == f"the candidate has its parent's weights: not moved ({stopped})"
+    assert world.rows(Campaign)[0].published_checkpoint_id == world.checkpoint_id
+    assert world.rows(Publication) == []
+
+
 def test_gate_does_not_undo_what_an_admin_published_meanwhile(world: World) -> None:
     other_round = _gated_round(world, PublishRule.MANUAL, before=0.9, after=0.9)
     _run(world, JobKind.PUBLISH, other_round)

@@ -8,7 +8,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -17,9 +18,12 @@ import pytest
 from rodif_core.errors import ValueOutOfRangeError
 from server.errors import LeaseLostError
 from server.settings import Settings
+from server.states import JobKind, JobState
+from server.store import jobs
 from server.store.beats import BEAT, last_beat, record_beat
+from server.store.tables import Job
 from tests.worker.rows import make_world
-from worker import running, supervisor
+from worker import interrupted, running, supervisor
 from worker.broker import broker_answers, end_orphan_broker, socket_path
 from worker.errors import ServiceCrashedError, StateInUseError, SystemStartError
 from worker.prepare import Prepared
@@ -194,6 +198,56 @@ def test_foreign_process_with_the_number_of_a_dead_broker_is_spared(tmp_path: Pa
     end_orphan_broker(pid_file)  # and we are still here
     pid_file.write_text("rubbish")
     end_orphan_broker(pid_file)
+
+
+@contextmanager
+def _process() -> Iterator[str]:
+    """A process for as long as the block lasts; gives it as the owner of a job."""
+    with subprocess.Popen(SLEEPER.command) as process:
+        try:
+            yield f"{socket.gethostname()}:{process.pid}"
+        finally:
+            process.kill()
+
+
+def test_planned_stops_use_up_no_attempts_but_a_job_that_kills_its_worker_is_capped(
+    tmp_path: Path,
+) -> None:
+    world = make_world(tmp_path)
+    job_id = world.enqueue_collect()
+    for _ in range(2 * jobs.DEFAULT_MAX_ATTEMPTS):  # Ctrl-C and `rodif up` again
+        with _process() as owner:
+            assert running._claim(world.workbench(owner), job_id) is not None
+            at_work = interrupted.claims_of_the_living(world.settings)
+            assert [claim.owner for claim in at_work] == [owner]
+        assert interrupted.hand_back(world.settings, at_work) == 1
+        supervisor.take_over(world.settings, world.clock())
+    for _ in range(jobs.DEFAULT_MAX_ATTEMPTS):  # the job kills its worker, then comes a stop
+        with _process() as owner:
+            assert running._claim(world.workbench(owner), job_id) is not None
+        assert interrupted.claims_of_the_living(world.settings) == []
+        supervisor.take_over(world.settings, world.clock())
+    with world.bench.database.write() as session:
+        assert running.give_up_exhausted(session, world.clock()) == 1
+    assert world.job_of(JobKind.COLLECT).state == JobState.FAILED
+
+
+def test_a_stop_gives_back_only_what_this_machine_was_still_at(tmp_path: Path) -> None:
+    world = make_world(tmp_path)
+    elsewhere, done, odd = (world.enqueue_collect(seed=seed) for seed in (0, 10, 20))
+    other_machine = world.workbench(f"another-machine:{os.getpid()}")
+    assert running._claim(other_machine, elsewhere) is not None
+    assert running._claim(world.workbench("no-process-id"), odd) is not None
+    with _process() as owner:
+        finishing = running._claim(world.workbench(owner), done)
+        assert finishing is not None
+        at_work = interrupted.claims_of_the_living(world.settings)
+        assert [claim.job_id for claim in at_work] == [done]
+        with finishing.step() as session:  # in the time that it is given to stop
+            finishing.finish(session, {})
+    assert interrupted.hand_back(world.settings, at_work) == 0
+    states = [job.state for job in world.rows(Job)]
+    assert states == [JobState.RUNNING, JobState.DONE, JobState.RUNNING]
 
 
 def test_take_over_forgets_old_signs_of_life_and_frees_interrupted_jobs(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import ValueOutOfRangeError
-from rodif_core.spec import EVALUATION_SEED, FinetuneMethod, RolloutConfig
+from rodif_core.spec import EVALUATION_SEED, FinetuneMethod
 from server.states import PublishRule
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def run_rounds(
     """The publishing round, and the comparison rounds on its snapshot; all from one parent."""
     from worker.cli import round as rounds
 
-    evaluation = RolloutConfig(episodes=config.evaluation_episodes, seed=EVALUATION_SEED)
+    evaluation = {"episodes": config.evaluation_episodes, "seed": EVALUATION_SEED}
     guided = rounds.launch(
         api,
         campaign_id,

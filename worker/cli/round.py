@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from rodif_core.spec import FinetuneMethod, RolloutConfig
+from rodif_core.spec import FinetuneMethod
 from server.states import PublishRule
 from worker.cli.options import add_config_argument, add_connection_arguments, connect
 
@@ -24,7 +24,7 @@ def launch(
     *,
     method: FinetuneMethod | None = None,
     publish_rule: PublishRule | None = None,
-    evaluation: RolloutConfig | None = None,
+    evaluation: Mapping[str, int] | None = None,
     snapshot_digest: str | None = None,
     updates: int | None = None,
     conservativeness: float | None = None,
@@ -32,15 +32,16 @@ def launch(
 ) -> dict[str, Any]:
     """Start a round; what is not given is taken from the campaign. Raises ApiError (409, 422).
 
-    `settings` are further ones of the fine-tuner, by their names in FinetuneConfig.
+    `evaluation` may hold "episodes", "seed" or both. `settings` are further ones of the fine-tuner,
+    by their names in FinetuneConfig.
     """
     given = {"method": method, "updates": updates, "conservativeness": conservativeness}
     config = {name: value for name, value in given.items() if value is not None}
     body: dict[str, Any] = {"config": {**(settings or {}), **config}}
     if publish_rule is not None:
         body["publish_rule"] = publish_rule
-    if evaluation is not None:
-        body["evaluation"] = {"episodes": evaluation.episodes, "seed": evaluation.seed}
+    if evaluation:
+        body["evaluation"] = dict(evaluation)
     if snapshot_digest is not None:
         body["snapshot_digest"] = snapshot_digest
     started: dict[str, Any] = api.post(f"/campaigns/{campaign_id}/rounds", body)
@@ -63,9 +64,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--publish", choices=list(PublishRule), help="default: what the campaign says"
     )
-    parser.add_argument("--episodes", type=int, help="rollouts of the evaluation")
     parser.add_argument(
-        "--seed", type=int, default=0, help="first seed of the evaluation, with --episodes"
+        "--episodes", type=int, help="rollouts of the evaluation; default: what the campaign says"
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        help="first seed of the evaluation; default: one that all rounds share, above those of the"
+        " rollouts that are labelled",
     )
     parser.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
     parser.add_argument(
@@ -89,9 +95,9 @@ def run(args: argparse.Namespace) -> int:
 
     from worker.cli.tables import evaluation_table
 
-    evaluation = None
-    if args.episodes is not None:
-        evaluation = RolloutConfig(episodes=args.episodes, seed=args.seed)
+    # What is not given must not be sent: zero is a seed of rollouts that were labelled.
+    given = {"episodes": args.episodes, "seed": args.seed}
+    evaluation = {name: value for name, value in given.items() if value is not None}
     with connect(args) as api:
         started = launch(
             api,
@@ -121,6 +127,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         rows = list(finished_tables(ended).items())
         Console().print(evaluation_table(f"round {ended['id']}", rows))
+        if ended.get("stopped"):
+            print(f"fine-tuning: {ended['stopped']}")
+    if ended["result"]["gate"].get("unchanged"):
+        print("nothing was learned: the candidate has its parent's weights", file=sys.stderr)
     if ended["state"] == "rejected":
         print(f"the gate refused: {ended['result'].get('gate')}", file=sys.stderr)
         return 1

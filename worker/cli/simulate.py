@@ -304,7 +304,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Label, then print what was given."""
+    """Label, then print what was given; 1 when that is less than was asked for."""
     config = SimulationConfig(
         annotators=args.annotators,
         labels=args.labels,
@@ -327,4 +327,5 @@ def run(args: argparse.Namespace) -> int:
             f"fewer than the {config.labels} asked for: collect more pairs first",
             file=sys.stderr,
         )
+        return 1
     return 0

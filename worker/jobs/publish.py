@@ -21,15 +21,21 @@ def run(attempt: Attempt) -> None:
         if this.result is None:
             raise LearningError(f"round {round_id} has no evaluation to judge")
         candidate = session.scalars(select(Checkpoint).where(Checkpoint.round_id == round_id)).one()
+        parent = session.get_one(Checkpoint, this.parent_checkpoint_id)
         verdict = judge(this.result["before"], this.result["after"])
         campaign = session.get_one(Campaign, this.campaign_id, with_for_update=True)
         reasons = list(verdict.reasons)
         moved = campaign.published_checkpoint_id != this.parent_checkpoint_id
         if moved:
             reasons.append("the published policy has changed since the round began: not moved")
-        gate = {"passed": verdict.passed, "reasons": reasons}
+        unchanged = candidate.digest == parent.digest
+        if unchanged:
+            reasons.append(_why_unchanged(candidate))
+        gate = {"passed": verdict.passed, "unchanged": unchanged, "reasons": reasons}
         this.result = this.result | {"gate": gate}
-        state = _decide(PublishRule(this.publish_rule), passed=verdict.passed, moved=moved)
+        state = _decide(
+            PublishRule(this.publish_rule), passed=verdict.passed, held=moved or unchanged
+        )
         now = attempt.bench.clock()
         if state == RoundState.PUBLISHED:
             publications.publish(
@@ -44,10 +50,17 @@ def run(attempt: Attempt) -> None:
         attempt.finish(session, {"state": state.value, "gate": gate})
 
 
-def _decide(rule: PublishRule, *, passed: bool, moved: bool) -> RoundState:
-    """`moved`: somebody published or rolled back meanwhile, which the gate must not undo."""
+def _why_unchanged(candidate: Checkpoint) -> str:
+    """Two evaluations of the same weights agree, so the gate passes them; nothing was learned."""
+    why = candidate.metrics.get("finetune", {}).get("stopped")
+    return "the candidate has its parent's weights: not moved" + (f" ({why})" if why else "")
+
+
+def _decide(rule: PublishRule, *, passed: bool, held: bool) -> RoundState:
+    """`held`: there is nothing new to publish, or somebody published or rolled back meanwhile,
+    which the gate must not undo."""
     if rule is not PublishRule.AUTO:
         return RoundState.KEPT
     if not passed:
         return RoundState.REJECTED
-    return RoundState.KEPT if moved else RoundState.PUBLISHED
+    return RoundState.KEPT if held else RoundState.PUBLISHED

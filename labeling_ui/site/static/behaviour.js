@@ -135,12 +135,20 @@ export function legend(evaluations, facts) {
   );
 }
 
-export function gate(verdict, state) {
+// What the gate of a round said, and what became of the candidate where that is not plain.
+export function gate(round) {
+  const verdict = round?.result?.gate;
   if (!verdict) return null;
   const title = verdict.passed ? "The gate passed" : "The gate refused";
   return element(
     "div.gate", {},
-    element("strong", {}, title), state === "kept" ? " · kept for an admin to publish" : "",
+    element("strong", {}, title), round.state === "kept" ? ` · ${whyKept(round)}` : "",
     element("ul", {}, verdict.reasons.map((reason) => element("li", {}, reason))),
+    round.stopped ? element("p.muted.small", {}, `Fine-tuning: ${round.stopped}`) : null,
   );
+}
+
+function whyKept({ publish_rule, result }) {
+  if (publish_rule === "never") return "for comparison, never published";
+  return result.gate.unchanged ? "not published, nothing was learned" : "kept for an admin to publish";
 }

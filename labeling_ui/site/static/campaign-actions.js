@@ -79,8 +79,10 @@ export function campaignActions(id, data, refresh) {
         { name: "evaluation_episodes", label: "Evaluation runs", kind: "number", value: now.evaluation_episodes, min: 10, max: 10000, step: 1, required: true },
         { name: "archived", label: "Campaign", kind: "select", value: String(before.archived), options: ARCHIVED, hint: "An archived campaign hands out no pairs and starts no rounds; nothing is deleted." },
       ],
-      // Only what was edited: the criterion is fixed once there are labels.
-      onSubmit: ({ name, criterion, archived, ...changed }) => {
+      // Only what was edited: the criterion is fixed once there are labels, and what somebody else
+      // has changed meanwhile is not to be changed back.
+      onSubmit: ({ name, criterion, archived, ...given }) => {
+        const changed = Object.fromEntries(Object.entries(given).filter(([key, value]) => value !== now[key]));
         const renamed = name === before.name ? {} : { name };
         const asked = criterion === plain(before.criterion) ? {} : { criterion };
         const moved = archived === String(before.archived) ? {} : { archived: archived === "true" };
@@ -89,8 +91,11 @@ export function campaignActions(id, data, refresh) {
     });
   };
 
+  const nameOf = (checkpointId) =>
+    data.checkpoints.find((item) => item.id === checkpointId)?.name ?? `Checkpoint ${checkpointId}`;
+
   const publish = (checkpointId) => {
-    const { name } = data.checkpoints.find((item) => item.id === checkpointId) ?? { name: `Checkpoint ${checkpointId}` };
+    const name = nameOf(checkpointId);
     return confirmed(`${name} is published.`, {
       title: `Publish ${name}?`,
       text: "From now on runs are collected from it, and rounds start from it. It can be rolled back.",
@@ -100,14 +105,18 @@ export function campaignActions(id, data, refresh) {
     });
   };
 
-  const rollBack = () => confirmed("Rolled back.", {
-    title: "Roll back?",
-    text: "Publishes again what was published before. Nothing is deleted.",
-    confirm: "Roll back",
-    danger: true,
-    fields: [REASON],
-    onSubmit: ({ reason }) => post(`/campaigns/${id}/rollback`, { reason }),
-  });
+  const rollBack = () => {
+    const checkpoint_id = data.stats.rollback_checkpoint_id; // as the dialog names it
+    const name = nameOf(checkpoint_id);
+    return confirmed(`Rolled back to ${name}.`, {
+      title: `Roll back to ${name}?`,
+      text: `Publishes ${name} again, which was published before. Nothing is deleted.`,
+      confirm: "Roll back",
+      danger: true,
+      fields: [REASON],
+      onSubmit: ({ reason }) => post(`/campaigns/${id}/rollback`, { checkpoint_id, reason }),
+    });
+  };
 
   const cancel = (round) => confirmed(`Round ${round.id} is cancelled.`, {
     title: `Cancel round ${round.id}?`,

@@ -187,7 +187,7 @@ function drawBehaviour() {
   }
   const box = find("#behaviour");
   const facts = taskFacts();
-  const { before, after, gate: verdict } = (shown && whole.round?.result) || {};
+  const { before, after } = (shown && whole.round?.result) || {};
   if (box.dataset.shown === whole.key) return;
   box.dataset.shown = whole.key;
   if (!before || !facts) {
@@ -197,7 +197,7 @@ function drawBehaviour() {
   }
   replace(box, element(
     "div.behaviour", {},
-    element("div", {}, measures(before, after), gate(verdict, shown.state)),
+    element("div", {}, measures(before, after), gate(whole.round)),
     element("div", {},
       element("div.maps", {}, pathMap("Before", before, facts), after ? pathMap("After", after, facts) : null),
       legend([before, after], facts)),

@@ -61,7 +61,7 @@ export function toast(text, { action = null, onAction = null, bad = false, secon
 }
 
 // A question with optional fields. Resolves to an object of the fields' values, or null.
-//   fields: [{name, label, kind: "text" | "number" | "select" | "textarea", value, options, hint, …}]
+//   fields: [{name, label, kind: "text" | "number" | "password" | "select" | "textarea", value, options, hint, …}]
 //     onChange: (value, form) => …, of a select
 //   onSubmit: async (values) => …; an error it throws is shown in the dialog, which stays open
 export function ask({ title, text = "", fields = [], confirm = "OK", danger = false, onSubmit }) {
@@ -146,7 +146,8 @@ function fieldRow(field) {
 function readFields(form, fields) {
   const values = {};
   for (const { name, kind } of fields) {
-    const text = form.elements[name].value.trim();
+    const { value } = form.elements[name];
+    const text = kind === "password" ? value : value.trim(); // to sign in, it is typed as it was set
     if (kind === "number") values[name] = text === "" ? null : Number(text);
     else values[name] = text;
   }
