@@ -1,4 +1,4 @@
-"""`rodif checkpoint`: a trained policy becomes one that campaigns start from."""
+"""`rodif checkpoint`: policies become what campaigns start from, and come out as files."""
 
 from __future__ import annotations
 
@@ -130,3 +130,36 @@ def test_folder_without_a_database_stays_empty(
     assert main(["checkpoint", "add", str(file), "--state", str(nowhere)]) == 1
     assert "there is no database" in capsys.readouterr().err
     assert not nowhere.exists()
+
+
+def test_what_was_added_comes_out_again_and_rolls_out(
+    api: RunningApi, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["checkpoint", "add", str(file), "--json", *state(api)]) == 0
+    added = json.loads(capsys.readouterr().out)
+    access = ["--url", api.url, "--token", api.token]
+    out = tmp_path / "deep" / "out.safetensors"
+    assert main(["checkpoint", "get", str(added["id"]), "--out", str(out), *access]) == 0
+    assert out.read_bytes() == file.read_bytes()
+    assert f"rodif rollout avoid --checkpoint {out}" in capsys.readouterr().out
+    assert main(["rollout", "avoid", "--checkpoint", str(out), "--n", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["checkpoint"] == added["digest"]
+
+
+def test_published_policy_of_a_campaign_is_what_get_takes_without_a_number(
+    api: RunningApi, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["checkpoint", "add", str(file), "--json", *state(api)]) == 0
+    added = json.loads(capsys.readouterr().out)
+    with api.admin() as admin:
+        admin.post(
+            "/campaigns",
+            {"name": "mine", "task": "avoid", "start_checkpoint_id": added["id"]},
+        )
+    out = ["--out", str(tmp_path / "out.safetensors"), "--url", api.url, "--token", api.token]
+    assert main(["checkpoint", "get", "--campaign", "mine", "--json", *out]) == 0
+    assert json.loads(capsys.readouterr().out)["digest"] == added["digest"]
+    assert main(["checkpoint", "get", "1", "--campaign", "mine", *out]) == 1
+    assert "checkpoint 1 and --campaign 'mine' both say which" in capsys.readouterr().err
+    assert main(["checkpoint", "get", "99999", *out]) == 1
+    assert "no checkpoint 99999" in capsys.readouterr().err

@@ -58,6 +58,8 @@ ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/checkpoints/1", None, STAFF),
     ("GET", "/checkpoints/1/lineage", None, STAFF),
     ("GET", "/checkpoints/1/labels", None, STAFF),
+    ("GET", "/checkpoints/1/file", None, STAFF),
+    ("GET", "/episodes/1/file", None, STAFF),
     ("POST", "/campaigns/1/publish", {"checkpoint_id": 1, "reason": ""}, ADMIN),
     ("POST", "/campaigns/1/rollback", {"reason": ""}, ADMIN),
     ("GET", "/campaigns/1/publications", None, ADMIN),

@@ -393,3 +393,14 @@ def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Pag
     with studio.database.read() as session:
         row = session.get_one(Campaign, campaign)
     assert (row.name, row.archived) == (name, False)
+
+
+def test_a_checkpoint_is_downloaded_from_its_row(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    with studio.database.read() as session:
+        start = session.get_one(Checkpoint, session.get_one(Campaign, campaign).start_checkpoint_id)
+    with page.expect_download() as started:
+        page.get_by_role("link", name=f"Download {start.name}").click()
+    assert started.value.suggested_filename == f"{start.name}.safetensors"
+    assert started.value.path().read_bytes() == studio.artifacts.get(start.artifact_sha256)

@@ -133,6 +133,7 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
       cell(ago(checkpoint.created_at), ".tight"),
       cell([
         element("button.button.small", { type: "button", onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
+        element("a.button.small", { href: `/api/v1/checkpoints/${checkpoint.id}/file`, download: "", "aria-label": `Download ${checkpoint.name}` }, "Download"), " ",
         published || checkpoint.comparison ? null
           : element("button.button.small", { type: "button", onclick: () => onPublish(checkpoint.id) }, "Publish"),
       ], ".tight"),
