@@ -66,6 +66,7 @@ ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/jobs", None, STAFF),
     ("GET", "/jobs/1", None, STAFF),
     ("POST", "/jobs/1/retry", None, STAFF),
+    ("POST", "/jobs/1/cancel", None, ADMIN),
     ("GET", "/audit", None, ADMIN),
 ]
 OPEN = {("POST", "/session"), ("DELETE", "/session"), ("GET", "/health"), ("GET", "/ready")}
