@@ -5,7 +5,7 @@
     ├── ValueOutOfRangeError    a number or text outside its legal range
     ├── TrajectoryFileError     an episode file that is missing, truncated or inconsistent
     ├── CheckpointFileError     a checkpoint file that is missing, truncated or inconsistent
-    ├── DemonstrationFileError  a file of foreign demonstrations that cannot be read
+    ├── DemonstrationFileError  a file of demonstrations that cannot be read or trained on
     ├── SimulationDivergedError the physics of one simulation blew up
     ├── GraphicsError           this machine cannot draw pictures off screen
     └── LearningError           fine-tuning or pretraining cannot go on (no labels …)
@@ -52,7 +52,7 @@ class SimulationDivergedError(RodifError):
 
 
 class DemonstrationFileError(RodifError):
-    """A file of foreign demonstrations that is damaged, of another task, or not plain data."""
+    """A file of demonstrations that is damaged, of another task, failed, or not plain data."""
 
 
 class GraphicsError(RodifError):

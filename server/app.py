@@ -9,7 +9,18 @@ from datetime import UTC, datetime
 from fastapi import FastAPI
 
 from server import pages
-from server.api import accounts, campaigns, errors, events, health, labels, leases, rounds
+from server.api import (
+    accounts,
+    campaigns,
+    errors,
+    events,
+    files,
+    health,
+    jobs,
+    labels,
+    leases,
+    rounds,
+)
 from server.api.guards import CarefulBrowsers, SameOriginGuard
 from server.api.services import Services
 from server.queue import SendJob, make_sender
@@ -71,7 +82,7 @@ def create_app(
         clock=clock or _utc_now,
     )
     errors.install(app)
-    for module in (accounts, campaigns, labels, leases, rounds, events, health):
+    for module in (accounts, campaigns, labels, leases, rounds, jobs, files, events, health):
         app.include_router(module.router, prefix=API_PREFIX)
     pages.install(app)
     app.add_middleware(SameOriginGuard)

@@ -23,6 +23,7 @@ from starlette.exceptions import HTTPException
 
 from server.api import errors
 from server.api.access import COOKIE, Anyone, UseServices, who
+from server.api.files import FOR_EVER
 from server.api.services import services_of
 from server.errors import ArtifactError, NotFoundError, NotSignedInError
 from server.replay_client import check_parameters, replay_client
@@ -37,7 +38,6 @@ PAGE_POLICY = (
 )
 _NUMBER = re.compile("[0-9]{1,10}", flags=re.ASCII)  # as many digits as MAX_ID has
 _SHA256 = re.compile("[0-9a-f]{64}", flags=re.ASCII)
-FOR_EVER = "private, max-age=31536000, immutable"  # content-addressed files never change
 
 router = APIRouter(include_in_schema=False)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from fastapi import APIRouter, Response, status
-from sqlalchemy import func, select
+from sqlalchemy import func, not_, select
 from sqlalchemy.orm import Session
 
 from server import handout, labeling
@@ -40,6 +40,7 @@ from server.schemas.labels import (
     UndoOut,
 )
 from server.states import Choice, PairState
+from server.store.labels import effective_among, is_effective
 from server.store.paging import page
 from server.store.tables import Episode, Label, Pair, SimulatedTruth
 
@@ -194,14 +195,23 @@ def list_labels(
     campaign_id: PathId,
     _me: Admin,
     session: ReadSession,
+    in_force: bool | None = None,
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> Page[RawLabel]:
-    """All label rows of the campaign with everything on record, oldest first."""
+    """Label rows of the campaign with everything on record, oldest first; all, unless asked for
+    those that are in force (the last word of their annotator, not taken back), or are not."""
     get_campaign(session, campaign_id)
     query = select(Label).where(Label.campaign_id == campaign_id)
+    if in_force is not None:
+        query = query.where(is_effective() if in_force else not_(is_effective()))
     rows, next_cursor = page(session, query, Label.id, limit=limit, cursor=cursor)
-    items = [RawLabel.model_validate(row) for row in rows]
+    effective = effective_among(session, [row.id for row in rows])
+    names = [name for name in RawLabel.model_fields if name != "in_force"]
+    items = [
+        RawLabel(in_force=row.id in effective, **{name: getattr(row, name) for name in names})
+        for row in rows
+    ]
     return Page[RawLabel](items=items, next_cursor=next_cursor)
 
 

@@ -99,7 +99,10 @@ class UndoOut(Out):
 
 
 class RawLabel(Out):
-    """A label row with everything on record."""
+    """A label row with everything on record.
+
+    `in_force`: nothing supersedes it, and it takes nothing back.
+    """
 
     id: int
     campaign_id: int
@@ -108,6 +111,7 @@ class RawLabel(Out):
     choice: Choice
     retracted: bool
     supersedes_id: int | None
+    in_force: bool
     left_episode_id: int
     right_episode_id: int
     first_checkpoint_id: int

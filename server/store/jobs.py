@@ -318,16 +318,19 @@ def cancel(session: Session, now: datetime, job_id: int) -> bool:
 
 
 def retry(session: Session, now: datetime, job_id: int) -> Job:
-    """Queue a failed job again with fresh attempts; raises ConflictError unless it has failed.
+    """Queue a failed job again with fresh attempts, or one that was cancelled by itself; raises
+    ConflictError for any other. Jobs that were cancelled with their round stay so.
 
     Attempts keep counting up, so that an old claim can never become valid again.
     """
     job = session.get(Job, job_id, with_for_update=True)
     if job is None:
         raise NotFoundError("job", job_id)
-    if job.state != JobState.FAILED:
+    called_off = job.state == JobState.CANCELLED and job.round_id is None
+    if job.state != JobState.FAILED and not called_off:
         raise ConflictError(
-            f"job {job_id} is {job.state!r}; only jobs in state 'failed' can be retried"
+            f"job {job_id} is {job.state!r}; only jobs in state 'failed', and collections and"
+            " replays in state 'cancelled', can be retried"
         )
     job.state = JobState.QUEUED
     job.max_attempts = job.attempt + DEFAULT_MAX_ATTEMPTS

@@ -33,6 +33,11 @@ def effective_label_ids(session: Session, campaign_id: int) -> list[int]:
     return list(session.scalars(query.order_by(Label.id)))
 
 
+def effective_among(session: Session, label_ids: Sequence[int]) -> set[int]:
+    """Those of the labels that hold now."""
+    return set(session.scalars(select(Label.id).where(Label.id.in_(label_ids), is_effective())))
+
+
 def count_effective(session: Session, campaign_id: int) -> int:
     """Number of labels that hold now."""
     query = select(func.count()).where(Label.campaign_id == campaign_id, is_effective())

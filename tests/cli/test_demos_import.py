@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 
 import pytest
 
 from rodif_core.demonstrations import load_demonstrations, make_demonstrations
+from rodif_core.policies.checkpoint import load_checkpoint
 from rodif_core.tasks import get_task
 from tests.core.d3il_files import d3il_record, write_record
 from tests.core.test_plain_pickle import Calls
@@ -37,6 +39,23 @@ def test_a_folder_becomes_a_set(folder: Path, tmp_path: Path, capsys: pytest.Cap
     assert [one.info["file"] for one in made] == ["env_0.pkl", "env_2.pkl"]
     assert all(one.success for one in made)
     assert main(["plot", "modes", str(out), "--out", str(picture)]) == 0
+
+
+def test_imported_files_become_a_policy(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out, file = tmp_path / "set.npz", tmp_path / "human.safetensors"
+    assert main(["demos", "import", "avoid", str(folder), "--out", str(out)]) == 0
+    sizes = ["--updates", "3", "--track", "0", "--evaluate", "0"]
+    assert main(["pretrain", "avoid", "--demos", str(out), "--out", str(file), *sizes]) == 0
+    assert "set.npz: 2 demonstrations (d3il 2)" in capsys.readouterr().err.replace("\n", "")
+    card = load_checkpoint(file.read_bytes()).card
+    told = card["demonstration_set"]
+    assert told["file"] == "set.npz"
+    assert told["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
+    assert (told["episodes"], told["sources"]) == (2, {"d3il": 2})
+    assert (card["demonstrations"], card["recoveries"]) == (2, 0)
+    assert main(["rollout", "avoid", "--checkpoint", str(file), "--n", "2"]) == 0
 
 
 def test_a_malicious_file_stops_the_import(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 from rich.progress import Progress
 
 from rodif_core import rollout as rollouts
+from rodif_core.demonstrations import make_demonstrations, save_demonstrations
 from rodif_core.encoder_training import EncoderConfig
 from rodif_core.errors import LearningError, ValueOutOfRangeError
 from rodif_core.policies.checkpoint import Checkpoint, load_checkpoint
@@ -19,8 +21,10 @@ from rodif_core.policies.resnet import ImageConfig
 from rodif_core.presets import PretrainConfig, preset_for
 from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import RolloutConfig, TaskName
+from rodif_core.tasks import get_task
 from rodif_core.trajectory import Trajectory
 from worker.cli import pretrain
+from worker.cli.main import main
 
 TASK, TOLD = TaskName.ALIGNING, TaskName.ALIGNING_STATE
 CONFIG = replace(
@@ -30,9 +34,9 @@ CONFIG = replace(
 )  # fmt: skip
 
 
-def trained(workspace: Path, **changes: int) -> Checkpoint:
+def trained(workspace: Path, demos: Path | None = None, **changes: Any) -> Checkpoint:
     args = argparse.Namespace(
-        task=TASK.value, demonstrations=4, preferred_share=None, seed=0, device="cpu",
+        task=TASK.value, demos=demos, demonstrations=4, preferred_share=None, seed=0, device="cpu",
         precision=None, workspace=workspace, track=0, processes=1,
     )  # fmt: skip
     with Progress(disable=True) as bar:
@@ -64,6 +68,51 @@ def test_encoder_learns_alone_in_looks_and_the_denoiser_moves_in_rounds(tmp_path
     assert not any(torch.equal(moved[name], begun[name]) for name in begun if "weight" in name)
     assert more.card["start"] == looked.digest
     assert "only_encoder" not in more.card and len(more.card["success_before_rounds"]) == 2
+
+
+def test_policy_that_sees_learns_from_a_set_with_pictures_drawn_of_it(tmp_path: Path):
+    file = tmp_path / "set.npz"
+    save_demonstrations(file, make_demonstrations(get_task(TASK), episodes=3, seed=2))
+    images = replace(CONFIG.images or ImageConfig(), told=0)
+    made = trained(
+        tmp_path / "work", file, begin_with=None, rounds=0, updates=2, images=images,
+    )  # fmt: skip
+    assert made.policy.encoder is not None
+    assert made.card["demonstration_set"]["sources"] == {"scripted": 3}
+    assert (made.card["demonstrations"], made.card["recoveries"]) == (3, 0)
+
+
+def test_a_set_has_rounds_only_where_they_are_asked_for(tmp_path: Path):
+    file = tmp_path / "set.npz"
+    save_demonstrations(file, make_demonstrations(get_task("sorting"), episodes=3, seed=2))
+    preset = preset_for(TaskName.SORTING, "cpu")
+    wishes = {"task": "sorting", "preset": "cpu", "demos": file}
+    none = {"demonstrations": None, "preferred_share": None}
+    assert preset.rounds == 3
+    asked = argparse.Namespace(**wishes, **none, rounds=None)
+    assert pretrain._for_a_set(asked, preset).rounds == 0
+    asked.rounds = 3
+    assert pretrain._for_a_set(asked, preset).rounds == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["avoid", "--demonstrations", "9"], "--demonstrations is for scripted demonstrations"),
+        (["avoid", "--left-share", "0.5"], "--preferred-share is for scripted demonstrations"),
+        (["pushing"], "is of task 'avoid', but must be of 'pushing'"),
+        (["aligning"], "begins with the shipped policy of 'aligning-state'.*--preset paper"),
+        (["stacking"], "begins with the shipped policy of 'stacking-state'.*--preset paper"),
+    ],
+)
+def test_what_does_not_go_together_with_a_set_is_told(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file, out = tmp_path / "set.npz", tmp_path / "policy.safetensors"
+    save_demonstrations(file, make_demonstrations(get_task("avoid"), episodes=2, seed=2))
+    assert main(["pretrain", *arguments, "--demos", str(file), "--out", str(out)]) == 1
+    assert re.search(message, capsys.readouterr().err)
+    assert not out.exists()
 
 
 def test_looks_need_a_policy_to_begin_with():

@@ -366,6 +366,29 @@ def test_admins_read_raw_rows_page_by_page(world: World) -> None:
     assert first["items"][0]["annotator_id"] == world.ids["ann"]
 
 
+def test_rows_tell_whether_they_are_in_force_and_can_be_asked_for_by_it(world: World) -> None:
+    campaign_id, _ = world.add_campaign(pairs=3)
+    handed = [_handed(world, "ann", campaign_id)]
+    _post(world, "ann", _body(handed[0]), key="edited")
+    _post(world, "ann", _body(handed[0], "right"), key="edit")  # supersedes row 1
+    _post(world, "ann", _body(_handed(world, "ann", campaign_id)), key="undone")
+    _undo(world, "ann", 3)  # row 4
+    _post(world, "bob", _body(_handed(world, "bob", campaign_id)), key="kept")
+    path = f"/campaigns/{campaign_id}/labels"
+    admin = world.client("ada")
+    told = {row["id"]: row["in_force"] for row in admin.get(path).json()["items"]}
+    assert told == {1: False, 2: True, 3: False, 4: False, 5: True}
+    with world.database.read() as session:
+        assert effective_label_ids(session, campaign_id) == [2, 5]
+    first = admin.get(f"{path}?in_force=true&limit=1").json()
+    assert [row["id"] for row in first["items"]] == [2] and first["next_cursor"] == 2
+    last = admin.get(f"{path}?in_force=true&limit=1&cursor=2").json()
+    assert [row["id"] for row in last["items"]] == [5] and last["next_cursor"] is None
+    rest = admin.get(f"{path}?in_force=false").json()["items"]
+    assert [row["id"] for row in rest] == [1, 3, 4]
+    assert admin.get(f"{path}?in_force=perhaps").status_code == 422
+
+
 def test_truth_of_simulated_annotators_is_kept_apart(world: World) -> None:
     campaign_id, _ = world.add_campaign(pairs=2, first_is_left=False)
     handed = _handed(world, "sam", campaign_id)

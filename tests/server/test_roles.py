@@ -58,12 +58,15 @@ ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/checkpoints/1", None, STAFF),
     ("GET", "/checkpoints/1/lineage", None, STAFF),
     ("GET", "/checkpoints/1/labels", None, STAFF),
+    ("GET", "/checkpoints/1/file", None, STAFF),
+    ("GET", "/episodes/1/file", None, STAFF),
     ("POST", "/campaigns/1/publish", {"checkpoint_id": 1, "reason": ""}, ADMIN),
     ("POST", "/campaigns/1/rollback", {"reason": ""}, ADMIN),
     ("GET", "/campaigns/1/publications", None, ADMIN),
     ("GET", "/jobs", None, STAFF),
     ("GET", "/jobs/1", None, STAFF),
     ("POST", "/jobs/1/retry", None, STAFF),
+    ("POST", "/jobs/1/cancel", None, ADMIN),
     ("GET", "/audit", None, ADMIN),
 ]
 OPEN = {("POST", "/session"), ("DELETE", "/session"), ("GET", "/health"), ("GET", "/ready")}

@@ -6,8 +6,10 @@ from datetime import UTC, datetime
 
 import pytest
 from playwright.sync_api import Page
+from sqlalchemy import select
 
 from server.bootstrap import register_checkpoint
+from server.store.tables import Campaign, Checkpoint
 from tests.ui.driving import sign_in
 from tests.ui.studio import Studio, task_facts
 from worker.cli.client import ApiError, Client
@@ -89,3 +91,37 @@ def test_another_task_proposes_its_own_criterion_unless_one_was_written(
     criterion.fill("My own words.")
     dialog.get_by_label("Robot task").select_option("pushing")
     assert criterion.input_value() == "My own words."
+
+
+def test_new_campaign_starts_from_the_policy_that_was_chosen(studio: Studio, page: Page) -> None:
+    name = studio.new_name("mine")
+    with studio.database.write() as session:
+        older = session.scalars(select(Checkpoint).where(Checkpoint.task == "avoid")).all()[-1]
+        newest = register_checkpoint(
+            session,
+            datetime.now(UTC),
+            studio.artifacts,
+            task="avoid",
+            name=name,
+            blob=name.encode(),
+            digest="3" * 64,
+            config={"task_facts": task_facts()},
+            metrics={},
+            code_version="test",
+        )
+    sign_in(page, studio, "admin", "/admin")
+    page.get_by_role("button", name="New campaign").click()
+    dialog = page.get_by_role("dialog", name="New campaign")
+    start = dialog.get_by_label("Policy to start from")
+    dialog.get_by_label("Robot task").select_option("avoid")
+    assert start.locator("option").first.inner_text() == f"{name} (newest pretrained)"
+    assert start.input_value() == str(newest.id)
+    start.locator(f'option[value="{older.id}"]').wait_for(state="attached")
+    start.select_option(str(older.id))
+    campaign = studio.new_name("campaign")
+    dialog.get_by_label("Name").fill(campaign)
+    dialog.get_by_role("button", name="Create").click()
+    page.get_by_role("heading", name=campaign).wait_for()
+    with studio.database.read() as session:
+        made = session.scalars(select(Campaign).where(Campaign.name == campaign)).one()
+    assert made.start_checkpoint_id == made.published_checkpoint_id == older.id

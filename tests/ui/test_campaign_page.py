@@ -9,10 +9,11 @@ import pytest
 from playwright.sync_api import Page
 from sqlalchemy import select
 
-from server import publications, rounds
+from server import campaigns, publications, rounds
 from server.labeling import ScreenChoice
-from server.states import JobKind, JobState, PublishRule, Role, RoundState
-from server.store.tables import Campaign, Checkpoint, Job, Publication, Round
+from server.states import JobKind, JobState, PairState, PublishRule, Role, RoundState
+from server.store import jobs
+from server.store.tables import Campaign, Checkpoint, Job, Pair, Publication, Round
 from tests.ui.driving import sign_in, until
 from tests.ui.rounds import WorkerStandIn, evaluation, label_all
 from tests.ui.studio import PASSWORD, Studio
@@ -459,3 +460,45 @@ def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Pag
     with studio.database.read() as session:
         row = session.get_one(Campaign, campaign)
     assert (row.name, row.archived) == (name, False)
+
+
+def test_a_checkpoint_is_downloaded_from_its_row(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign()
+    open_campaign(page, studio, campaign)
+    with studio.database.read() as session:
+        start = session.get_one(Checkpoint, session.get_one(Campaign, campaign).start_checkpoint_id)
+    with page.expect_download() as started:
+        page.get_by_role("link", name=f"Download {start.name}").click()
+    assert started.value.suggested_filename == f"{start.name}.safetensors"
+    assert started.value.path().read_bytes() == studio.artifacts.get(start.artifact_sha256)
+
+
+def test_a_collection_is_cancelled_on_its_card_and_a_replay_in_its_row(
+    studio: Studio, page: Page
+) -> None:
+    campaign = studio.add_campaign([True], replays=False)
+    now = datetime.now(UTC)
+    with studio.database.write() as session:
+        pair = session.scalars(select(Pair).where(Pair.campaign_id == campaign)).one()
+        replay = jobs.enqueue(
+            session,
+            now,
+            kind=JobKind.REPLAY,
+            campaign_id=campaign,
+            payload={},
+            pair_id=pair.id,
+        ).id
+        collect = campaigns.start_collect(session, now, campaign, {}, by=1).id
+    open_campaign(page, studio, campaign)
+    live = page.locator(".live")
+    live.get_by_role("button", name="Cancel").click()
+    assert "The runs that are stored stay." in page.get_by_role("dialog").inner_text()
+    confirm(page, "Cancel job")
+    live.wait_for(state="detached")
+    page.locator(f'[data-job="{replay}"]').get_by_role("button", name="Cancel").click()
+    confirm(page, "Cancel job")
+    page.locator(f'[data-job="{replay}"]').wait_for(state="detached")
+    with studio.database.read() as session:
+        states = {number: session.get_one(Job, number).state for number in (collect, replay)}
+        assert states == {collect: JobState.CANCELLED, replay: JobState.CANCELLED}
+        assert session.get_one(Pair, pair.id).state == PairState.FAILED

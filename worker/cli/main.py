@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from rodif_core.errors import RodifError
 from worker.cli import (
     bench,
+    checkpoint,
     demo,
     demos,
     doctor,
@@ -36,6 +37,7 @@ COMMANDS = {
     "plot": plot,
     "demos": demos,
     "pretrain": pretrain,
+    "checkpoint": checkpoint,
     "bench": bench,
     "doctor": doctor,
     "migrate": migrate,

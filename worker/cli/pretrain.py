@@ -1,4 +1,5 @@
-"""`rodif pretrain`: scripted demonstrations, then imitation; writes one checkpoint file."""
+"""`rodif pretrain`: demonstrations, scripted or from a file, then imitation; writes one checkpoint
+file."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ import argparse
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rodif_core.errors import ValueOutOfRangeError
+from rodif_core.errors import RodifError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from rodif_core.policies.checkpoint import Checkpoint
     from rodif_core.presets import PretrainConfig
+    from rodif_core.tasks import Task
     from rodif_core.training_state import UpdateProgress
     from rodif_core.trajectory import Trajectory
 
@@ -26,22 +28,16 @@ PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does no
 # Fields of a preset that an argument changes.
 OF_PRESETS = ("updates", "executed_steps", "rounds", "recoveries", "drives", "round_updates")
 PRECISIONS = ("float32", "bfloat16")  # of rodif_core.training_state
+DEMONSTRATIONS = 2000  # scripted ones, unless said
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
-    parser = subparsers.add_parser("pretrain", help="train a policy on scripted demonstrations")
+    parser = subparsers.add_parser("pretrain", help="train a policy on demonstrations")
     parser.add_argument("task", choices=list(TaskName))
     parser.add_argument("--out", type=Path, required=True, help="checkpoint file to write")
     parser.add_argument("--preset", choices=PRESET_NAMES, default="cpu")
-    parser.add_argument("--demonstrations", type=int, default=2000)
-    parser.add_argument(
-        "--preferred-share",
-        "--left-share",
-        type=float,
-        help="share of demonstrations in the preferred group, for avoid: on the left"
-        " (default: the task's)",
-    )
+    _add_demonstration_arguments(parser)
     parser.add_argument("--updates", type=int, help="from fresh weights (default: the preset's)")
     parser.add_argument(
         "--executed-steps", type=int, help="control steps between two decisions (default: preset's)"
@@ -87,8 +83,30 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
 
 
+def _add_demonstration_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is shown: a set from a file, or scripted demonstrations made now."""
+    parser.add_argument(
+        "--demos",
+        type=Path,
+        metavar="FILE",
+        help="a set of `rodif demos` or `rodif demos import`, in place of scripted demonstrations;"
+        " rounds only where --rounds asks for them",
+    )
+    # No defaults here: they do not go together with --demos, so we must know who was given.
+    parser.add_argument(
+        "--demonstrations", type=int, help=f"how many scripted ones (default {DEMONSTRATIONS})"
+    )
+    parser.add_argument(
+        "--preferred-share",
+        "--left-share",
+        type=float,
+        help="share of demonstrations in the preferred group, for avoid: on the left"
+        " (default: the task's)",
+    )
+
+
 def run(args: argparse.Namespace) -> int:
-    """Demonstrate, train, let the expert take over and train again, measure, write."""
+    """Demonstrate or read, train, let the expert take over and train again, measure, write."""
     for name in ("evaluate", "track"):
         if getattr(args, name) < 0:
             raise ValueOutOfRangeError(name, getattr(args, name), "at least 0")
@@ -105,6 +123,8 @@ def run(args: argparse.Namespace) -> int:
     wishes = {name: getattr(args, name) for name in OF_PRESETS}
     given = {name: value for name, value in wishes.items() if value is not None}
     config = replace(preset_for(task_name, args.preset), seed=args.seed, **given)
+    if args.demos is not None:
+        config = _for_a_set(args, config)
     console = Console(stderr=True)
     with Progress(console=console) as bar:
         checkpoint = _train(args, config, bar)
@@ -116,9 +136,56 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _for_a_set(args: argparse.Namespace, config: PretrainConfig) -> PretrainConfig:
+    """The configuration for demonstrations out of a file.
+
+    In rounds scripted experts take over from the policy, so they are left out unless asked for.
+    Raises RodifError for arguments that are about scripted demonstrations, and for a preset that
+    begins with a policy which has learned from those.
+    """
+    for name in ("demonstrations", "preferred_share"):
+        if getattr(args, name) is not None:
+            raise RodifError(
+                f"--{name.replace('_', '-')} is for scripted demonstrations, and --demos takes all"
+                f" of {args.demos}; give one or the other"
+            )
+    if config.begin_with is not None:
+        raise RodifError(
+            f"preset {args.preset!r} of task {args.task!r} begins with the shipped policy of"
+            f" {config.begin_with.value!r}, which learned from scripted demonstrations, so --demos"
+            f" cannot decide what it does; legal are --preset paper, which begins with fresh"
+            f" weights, or task {config.begin_with.value!r} with a set of its own"
+        )
+    return config if args.rounds is not None else replace(config, rounds=0)
+
+
+def _first_shown(
+    args: argparse.Namespace, task: Task, bar: Progress
+) -> tuple[list[Trajectory], dict[str, Any]]:
+    """Demonstrations for the first training, and what the card tells of where they come from."""
+    from rodif_core.demonstration_set import read_set
+    from rodif_core.demonstrations import make_demonstrations
+
+    if args.demos is not None:
+        shown, told = read_set(task, args.demos)
+        sources = ", ".join(f"{source} {count}" for source, count in told["sources"].items())
+        said = f"{args.demos}: {len(shown)} demonstrations ({sources})"
+        bar.console.print(said, markup=False, highlight=False)
+        return shown, {"demonstration_set": told}
+    episodes = DEMONSTRATIONS if args.demonstrations is None else args.demonstrations
+    making = bar.add_task("demonstrations", total=episodes)
+    shown = make_demonstrations(
+        task,
+        episodes=episodes,
+        seed=args.seed,
+        preferred_share=args.preferred_share,
+        progress=lambda done, _: bar.update(making, completed=done),
+    )
+    return shown, {}
+
+
 def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> Checkpoint:
     """The first training and the rounds after it, each on all that experts have shown so far."""
-    from rodif_core.demonstrations import make_demonstrations
     from rodif_core.policies.checkpoint import load_checkpoint
     from rodif_core.pretrain import pretrain
     from rodif_core.shipped import shipped_checkpoint
@@ -126,15 +193,8 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     from rodif_core.training_state import Precision, check_device
 
     check_device(args.device)
-    task = get_task(args.task)
-    making = bar.add_task("demonstrations", total=args.demonstrations)
-    shown = make_demonstrations(
-        task,
-        episodes=args.demonstrations,
-        seed=args.seed,
-        preferred_share=args.preferred_share,
-        progress=lambda done, _: bar.update(making, completed=done),
-    )
+    shown, told = _first_shown(args, get_task(args.task), bar)
+    shown_first = len(shown)
     checkpoint = None
     if config.begin_with is not None:
         checkpoint = load_checkpoint(shipped_checkpoint(config.begin_with))
@@ -170,8 +230,9 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     assert checkpoint is not None
     facts = {
         "rounds": config.rounds,
-        "recoveries": len(shown) - args.demonstrations,
+        "recoveries": len(shown) - shown_first,
         "success_before_rounds": on_the_way,
+        **told,
     }
     return replace(checkpoint, card=checkpoint.card | facts)
 

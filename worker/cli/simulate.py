@@ -156,11 +156,8 @@ class TrueChoices:
 
     def count_missing_preferences(self) -> int:
         """How many more preferences the campaign's pairs can take."""
-        rows = list(self._api.pages(f"/campaigns/{self._campaign['id']}/labels?limit=500"))
-        superseded = {row["supersedes_id"] for row in rows}
-        given = Counter(
-            row["pair_id"] for row in rows if row["id"] not in superseded and not row["retracted"]
-        )
+        path = f"/campaigns/{self._campaign['id']}/labels?in_force=true&limit=500"
+        given = Counter(row["pair_id"] for row in self._api.pages(path))
         wanted: int = self._campaign["settings"]["labels_per_pair"]
         return sum(
             max(0, wanted - given[pair_id])

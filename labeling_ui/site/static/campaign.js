@@ -6,6 +6,7 @@ import { campaignActions } from "./campaign-actions.js";
 import { campaignData, PARTS } from "./campaign-data.js";
 import { drawCurves } from "./curves.js";
 import { describe, element, enable, find, replace } from "./dom.js";
+import { cancelJob } from "./job-actions.js";
 import { isRunning, liveCollect, liveRound, liveWords, showProgress } from "./live.js";
 import * as panels from "./panels.js";
 import { renew } from "./steady.js";
@@ -147,7 +148,7 @@ async function showMore(name) {
 function drawJobs() {
   const { queued, running, failed } = data.stats.jobs;
   find("#jobs-note").textContent = `${queued} queued · ${running} running · ${failed} failed`;
-  renew(find("#jobs"), panels.jobTable(data.jobs, { onRetry: actions.retry }));
+  renew(find("#jobs"), panels.jobTable(data.jobs, { onRetry: actions.retry, onCancel: (job) => cancelJob(job, refresh) }));
 }
 
 function drawLive() {
@@ -157,7 +158,7 @@ function drawLive() {
   const jobOf = (round) => open.find((job) => job.round_id === round.id);
   renew(
     find("#live"),
-    rounds.map((round) => liveRound(round, jobOf(round), () => actions.cancel(round))), collecting.map(liveCollect),
+    rounds.map((round) => liveRound(round, jobOf(round), () => actions.cancel(round))), collecting.map((job) => liveCollect(job, () => cancelJob(job, refresh))),
   );
   renew(find("#live-state"), liveWords(rounds, collecting));
 }

@@ -33,10 +33,15 @@ export function liveRound(round, job, onCancel) {
   );
 }
 
-export function liveCollect(job) {
+export function liveCollect(job, onCancel) {
   return element(
     "div.card.live", { dataset: { key: `job ${job.id}`, job: job.id } },
-    element("div.live-head", {}, element("h2", {}, "Collecting runs of the published policy")), meter(job),
+    element(
+      "div.live-head", {},
+      element("h2", {}, "Collecting runs of the published policy"),
+      element("button.button.small", { type: "button", onclick: onCancel }, "Cancel"),
+    ),
+    meter(job),
   );
 }
 

@@ -2,6 +2,7 @@
 
 import { element } from "./dom.js";
 import { ago, count, duration, interval, percent, short, words } from "./format.js";
+import { canBeCancelled } from "./job-actions.js";
 
 const STATE_LOOK = {
   published: "good", done: "good", ready: "good",
@@ -133,6 +134,7 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
       cell(ago(checkpoint.created_at), ".tight"),
       cell([
         element("button.button.small", { type: "button", onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
+        element("a.button.small", { href: `/api/v1/checkpoints/${checkpoint.id}/file`, download: "", "aria-label": `Download ${checkpoint.name}` }, "Download"), " ",
         published || checkpoint.comparison ? null
           : element("button.button.small", { type: "button", onclick: () => onPublish(checkpoint.id) }, "Publish"),
       ], ".tight"),
@@ -142,7 +144,14 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
   return table(heads, rows, "No checkpoint.");
 }
 
-export function jobTable(jobs, { onRetry }) {
+// What can be done about a job by hand, if anything.
+function jobButton(job, onRetry, onCancel) {
+  const button = (name, onclick) => element("button.button.small", { type: "button", onclick }, name);
+  if (job.state === "failed") return button("Retry", () => onRetry(job));
+  return canBeCancelled(job) ? button("Cancel", () => onCancel(job)) : null;
+}
+
+export function jobTable(jobs, { onRetry, onCancel }) {
   const rows = jobs.map((job) => element(
     "tr", { dataset: { key: job.id, job: job.id } },
     cell(`${words(job.kind)} ${job.id}`),
@@ -150,7 +159,7 @@ export function jobTable(jobs, { onRetry }) {
     cell([job.stage, job.state === "running" ? under(percent(job.progress)) : null]),
     cell(job.attempt, ".number"),
     cell(ago(job.finished_at ?? job.started_at ?? job.created_at), ".tight"),
-    cell(job.state === "failed" ? element("button.button.small", { type: "button", onclick: () => onRetry(job) }, "Retry") : null, ".tight"),
+    cell(jobButton(job, onRetry, onCancel), ".tight"),
   ));
   return table([["Job"], ["State"], ["Stage"], ["Attempts", "number"], ["When"], [""]], rows, "Nothing is waiting, running or failed.");
 }
