@@ -19,6 +19,9 @@ from rodif_core.policies.telling import Telling
 
 GROUP_CHANNELS = 16  # channels that share a normalisation; all of them where there are fewer
 STAGES = ((1, 1), (2, 2), (4, 2), (8, 2))  # width factor and stride of ResNet-18's four stages
+# On processors with AVX2 and no more, the backward convolution of torch 2.13 (oneDNN) writes past
+# its memory with 4 channels, and the process dies; with 8 it does not.
+LEAST_WIDTH = 8
 SHRINK = 32  # one entry of the last feature map stands for this many pixels
 
 
@@ -41,9 +44,9 @@ class ImageConfig:
         if self.pixels < 2 * SHRINK or self.pixels % SHRINK:
             legal = f"a multiple of {SHRINK}, at least {2 * SHRINK}"
             raise ValueOutOfRangeError("pixels", self.pixels, legal)
-        if self.width < 1 or (self.width > GROUP_CHANNELS and self.width % GROUP_CHANNELS):
+        if self.width != LEAST_WIDTH and (self.width < 1 or self.width % GROUP_CHANNELS):
             raise ValueOutOfRangeError(
-                "width", self.width, f"1 … {GROUP_CHANNELS} or a multiple of {GROUP_CHANNELS}"
+                "width", self.width, f"{LEAST_WIDTH} or a multiple of {GROUP_CHANNELS}"
             )
 
     @property

@@ -29,7 +29,7 @@ from worker.cli.main import main
 TASK, TOLD = TaskName.ALIGNING, TaskName.ALIGNING_STATE
 CONFIG = replace(
     preset_for(TOLD, "cpu"), begin_with=TOLD, rounds=2, recoveries=3, round_updates=5,
-    images=ImageConfig(pixels=64, width=4, keypoints=4, told=14),
+    images=ImageConfig(pixels=64, width=8, keypoints=4, told=14),
     encoder=EncoderConfig(moments=50, updates=3, round_updates=2, batch_size=8),
 )  # fmt: skip
 

@@ -120,6 +120,7 @@ def test_encoder_refuses_frames_of_another_type_or_shape() -> None:
         ("pixels", 100, "multiple of 32, at least 64"),
         ("pixels", 32, "multiple of 32, at least 64"),
         ("width", 24, "multiple of 16"),
+        ("width", 4, "8 or a multiple of 16"),
     ],
 )
 def test_image_config_names_value_and_legal_ones(field: str, value: int, legal: str) -> None:

@@ -73,7 +73,7 @@ def test_moments_are_the_asked_number_and_the_rearranged_ones_come_last():
     task = get_task(TaskName.ALIGNING)
     episodes = shown(task)
     states = Normaliser.fit([d.observations for d in episodes], [d.actions for d in episodes])
-    images = ImageConfig(pixels=64, width=4, keypoints=4)
+    images = ImageConfig(pixels=64, width=8, keypoints=4)
     plain = Moments.draw(task, episodes, images, states, 6)
     both = Moments.draw(task, episodes, images, states, 6, 5, np.random.default_rng(0))
     assert both.frames.shape == (11, 2, 64, 64, 3)

@@ -31,7 +31,7 @@ from rodif_core.tasks.camera import Camera
 from rodif_core.trajectory import Trajectory
 
 TASK = get_task(TaskName.ALIGNING)
-IMAGES = ImageConfig(pixels=64, width=4, keypoints=4)
+IMAGES = ImageConfig(pixels=64, width=8, keypoints=4)
 ENCODER = EncoderConfig(moments=200, updates=40, batch_size=16, warm_up=5, learning_rate=3e-3)
 CONFIG = PretrainConfig(
     size=MlpSize(width=16, blocks=1),

@@ -28,7 +28,7 @@ from rodif_core.trajectory import Trajectory
 
 TASK = get_task(TaskName.ALIGNING)
 FELT, HIDDEN = TASK.proprioception_dim, TASK.observation_dim - TASK.proprioception_dim
-IMAGES = ImageConfig(pixels=64, width=4, keypoints=4, told=HIDDEN)
+IMAGES = ImageConfig(pixels=64, width=8, keypoints=4, told=HIDDEN)
 ENCODER = EncoderConfig(
     moments=200, updates=60, round_updates=4, batch_size=16, warm_up=5, learning_rate=3e-3
 )

@@ -16,8 +16,8 @@ from server.store import jobs
 from server.store.tables import Checkpoint, Job, Round
 from worker.attempt import Attempt
 
-# Episodes stepped together: progress shows after each portion. `rodif evaluate` steps more together,
-# so that its paths differ in their last digits, and now and then an episode ends otherwise.
+# Episodes stepped together: progress shows after each portion. `rodif evaluate` steps more of them
+# together, so that its paths differ in their last digits, and now and then an episode's end.
 BATCH = 50
 
 
