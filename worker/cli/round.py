@@ -67,7 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--seed", type=int, default=0, help="first seed of the evaluation, with --episodes"
     )
-    parser.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
+    parser.add_argument("--updates", type=int, help="full-batch updates of the literal methods")
     parser.add_argument(
         "--conservativeness", type=float, help="γ in [0, 1); default: estimated from the labels"
     )
