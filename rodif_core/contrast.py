@@ -1,4 +1,4 @@
-"""The paper's fine-tuners, literally: full-batch Adam on the RoDiF or the DP-DPO loss."""
+"""The literal fine-tuners: full-batch Adam on one of the losses of `losses.LOSSES`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rodif_core.errors import LearningError
 from rodif_core.log_ratio import PairMatrix, Transitions, accumulate_gradient, preference_loss
 from rodif_core.losses import DEAD_GRADIENT
 from rodif_core.policies.policy import DiffusionPolicy
-from rodif_core.spec import FinetuneConfig, FinetuneMethod
+from rodif_core.spec import FinetuneConfig
 from rodif_core.training_state import load_state, save_state
 
 # stage, fraction of the stage in 0 … 1, metrics to plot; raising from it stops the work
@@ -43,10 +43,11 @@ def contrast(
 ) -> ContrastResult:
     """Up to `config.updates` exact full-batch updates.
 
-    With RoDiF the optimizer stops as soon as the gate shuts (the votes passed their threshold):
-    the loss is flat there, but Adam's momentum alone would go on and wreck the policy. A gate
-    that is shut before the first update (γ ≥ 0.5 with the sum) is reported in `stopped`. Goes on
-    from `workspace` when a partial state is there. Raises LearningError on a non-finite loss.
+    With a loss that has a gate (RoDiF) the optimizer stops as soon as it shuts (the votes passed
+    their threshold): the loss is flat there, but Adam's momentum alone would go on and wreck the
+    policy. A gate that is shut before the first update (γ ≥ 0.5 with the sum) is reported in
+    `stopped`. Goes on from `workspace` when a partial state is there. Raises LearningError on a
+    non-finite loss.
     """
     policy = reference.copy()
     optimizer = torch.optim.Adam(policy.denoiser.parameters(), lr=config.learning_rate)
@@ -79,7 +80,7 @@ def contrast(
 
 
 def _gate_is_shut(metrics: dict[str, Any], config: FinetuneConfig, update: int) -> str | None:
-    if config.method is FinetuneMethod.DP_DPO:
+    if "gate_margin" not in metrics:  # a loss without a gate pulls until the updates are done
         return None
     # The slope is that of the loss; its outer logistic's own is outer_temperature times it.
     if update == 0 and metrics["outer_slope"] * config.outer_temperature < DEAD_GRADIENT:

@@ -1,8 +1,8 @@
 """Fine-tuning: a checkpoint, trajectories and preferences in; a candidate checkpoint out.
 
-`rodif` and `dp_dpo` minimise the paper's losses (`contrast`); `rodif_guided`, the default, scores
-the trajectories with RoDiF and then guides (`guided`). Same labels, same door. Deterministic on a
-CPU: equal arguments give equal weights.
+`rodif`, `dp_dpo`, `ipo`, `cpo` and `simpo` minimise a loss (`contrast`); `rodif_guided`, the
+default, scores the trajectories with RoDiF and then guides (`guided`). Same labels, same door.
+Deterministic on a CPU: equal arguments give equal weights.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rodif_core.log_ratio import PairMatrix, Transitions, kl_per_trajectory
 from rodif_core.policies.checkpoint import Checkpoint
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.preferences.pairs import Preference, Tie
-from rodif_core.spec import FinetuneConfig, FinetuneMethod
+from rodif_core.spec import GATED_METHODS, FinetuneConfig, FinetuneMethod
 from rodif_core.training_state import claim_workspace
 from rodif_core.trajectory import Trajectory
 
@@ -33,7 +33,7 @@ class FinetuneResult:
 
     report: method, pairs, ties, trajectories, decisions, kl_winners and kl_losers (nats per
     decision on the stored states of trajectories that win or lose most of their labels); of the
-    paper's methods curve and stopped; of `rodif_guided` scores, base, trials, self_training and
+    literal methods curve and stopped; of `rodif_guided` scores, base, trials, self_training and
     chosen.
     """
 
@@ -54,13 +54,13 @@ def finetune(
     """Steer the policy towards the preferred trajectories; the given checkpoint is the reference.
 
     preferences and ties index into trajectories; only `rodif_guided` learns from ties, the
-    paper's methods know none. `workspace` keeps partial state, so that a second call with the same
+    literal methods know none. `workspace` keeps partial state, so that a second call with the same
     arguments goes on where the first was killed: after the last saved update, and for
     `rodif_guided` after the last finished trial. Raises LearningError without usable labels, when
-    conservativeness is not set (estimate it from the labels first), and for a workspace of another
-    fine-tuning.
+    conservativeness is not set for a method that needs it (estimate it from the labels first), and
+    for a workspace of another fine-tuning.
     """
-    if config.conservativeness is None and config.method is not FinetuneMethod.DP_DPO:
+    if config.conservativeness is None and config.method in GATED_METHODS:
         raise LearningError("conservativeness is not set: estimate it from the labels first")
     labels: list[Preference | Tie] = [*preferences, *ties]
     for label in labels:

@@ -3,10 +3,11 @@
 Legend: N transitions (all decision steps of all trajectories), M pairs, T compared steps,
 K denoising steps, To observation history, Tp predicted chunk, O observation dims, A action dims.
 
-Reference means are computed once and cached. An update takes two passes in bounded memory: the
-first gives the log-ratio of every transition without a graph, from which the loss yields one
-weight dL/d(log-ratio) per transition; the second runs the network in chunks and back-propagates
-weight · log-ratio. The gradients add up to the full-batch gradient exactly (chain rule).
+Reference means and log-probabilities are computed once and cached. An update takes two passes in
+bounded memory: the first gives the log-ratio of every transition without a graph, from which the
+loss yields one weight dL/d(log-ratio) per transition; the second runs the network in chunks and
+back-propagates weight · log-ratio. The gradients add up to the full-batch gradient exactly (chain
+rule).
 """
 
 from __future__ import annotations
@@ -18,12 +19,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rodif_core.diffusion.chain import chain_kl, chain_means, log_prob_ratio
+from rodif_core.diffusion.chain import (
+    chain_kl,
+    chain_means,
+    log_prob_of_chunk_steps,
+    log_prob_ratio,
+)
 from rodif_core.errors import LearningError
-from rodif_core.losses import LossOutput, compute_delta_q, dp_dpo_loss, rodif_loss
+from rodif_core.losses import Compared, LossOutput, compute_delta_q, loss_of
 from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.preferences.pairs import Preference
-from rodif_core.spec import FinetuneConfig, FinetuneMethod, StepPairing
+from rodif_core.spec import FinetuneConfig, StepPairing
 from rodif_core.trajectory import Trajectory
 
 
@@ -32,36 +38,45 @@ class Transitions:
     """Decision steps of all trajectories, one after the other.
 
     histories (N, To, O) and chains (N, K + 1, Tp, A) normalised; ref_means (N, S, Tp, A) of the
-    reference policy for S scored steps; starts (trajectories + 1,): trajectory i owns the rows
-    starts[i] … starts[i + 1] - 1.
+    reference policy for S scored steps; ref_log_probs (N, Tp): log π_ref of each chain in nats,
+    split by steps of the chunk; executed_steps: how many of them, from the first on, are executed;
+    starts (trajectories + 1,): trajectory i owns the rows starts[i] … starts[i + 1] - 1.
     """
 
     histories: Tensor
     chains: Tensor
     ref_means: Tensor
+    ref_log_probs: Tensor
+    executed_steps: int
     starts: tuple[int, ...]
 
     @classmethod
     def collect(
         cls, reference: DiffusionPolicy, trajectories: Sequence[Trajectory], chunk_rows: int
     ) -> Transitions:
-        """Stack the trajectories and cache the reference means.
+        """Stack the trajectories and cache the reference means and log-probabilities.
 
         Raises LearningError as `stack_decisions` does.
         """
         normalised, chains = stack_decisions(reference, trajectories)
         counts = [len(trajectory.decision_steps) for trajectory in trajectories]
         starts = (0, *np.cumsum(counts).tolist())
+        denoiser, schedule = reference.denoiser, reference.schedule
+        means, log_probs = [], []
         with torch.no_grad():
-            parts = [
-                chain_means(reference.denoiser, reference.schedule, normalised[a:b], chains[a:b])
-                for a, b in _chunks(len(chains), reference, chunk_rows)
-            ]
-        return cls(normalised, chains, torch.cat(parts), starts)
+            for a, b in _chunks(len(chains), reference, chunk_rows):
+                means.append(chain_means(denoiser, schedule, normalised[a:b], chains[a:b]))
+                log_probs.append(log_prob_of_chunk_steps(schedule, chains[a:b], means[-1]))
+        executed = reference.config.executed_steps
+        return cls(normalised, chains, torch.cat(means), torch.cat(log_probs), executed, starts)
 
     def steps_of(self, trajectory: int) -> range:
         """Rows of one trajectory."""
         return range(self.starts[trajectory], self.starts[trajectory + 1])
+
+    def counted_steps(self, config: FinetuneConfig) -> int:
+        """Steps of a chunk, from the first on, that log-ratios and log-probabilities sum over."""
+        return self.executed_steps if config.executed_only else self.chains.shape[2]
 
 
 def stack_decisions(
@@ -99,11 +114,17 @@ def _check_shapes(reference: DiffusionPolicy, trajectories: Sequence[Trajectory]
 
 @dataclass(frozen=True, eq=False)
 class PairMatrix:
-    """Which transitions are compared: winners, losers (M, T) int64 rows; weights (M, T) ≥ 0."""
+    """Which transitions are compared, and what of them stays the same while the policy moves.
+
+    winners, losers (M, T) int64 rows; weights (M, T) ≥ 0; ref_log_probs (N,): log π_ref of every
+    transition in nats; entries: numbers of a chain that each log-probability sums over.
+    """
 
     winners: Tensor
     losers: Tensor
     weights: Tensor
+    ref_log_probs: Tensor
+    entries: int
 
     @classmethod
     def build(
@@ -134,7 +155,10 @@ class PairMatrix:
             states = transitions.histories[:, -1]
             distance = (states[winners] - states[losers]).norm(dim=-1)
             weights = weights * torch.exp(-0.5 * (distance / config.matched_state_scale) ** 2)
-        return cls(winners, losers, weights)
+        counted = transitions.counted_steps(config)
+        _, scored, _, actions = transitions.ref_means.shape
+        ref_log_probs = transitions.ref_log_probs[:, :counted].sum(dim=1)
+        return cls(winners, losers, weights, ref_log_probs, scored * counted * actions)
 
 
 def compute_ratios(
@@ -172,21 +196,23 @@ def kl_per_trajectory(
 
 
 def preference_loss(ratios: Tensor, matrix: PairMatrix, config: FinetuneConfig) -> LossOutput:
-    """The configured loss as a function of all log-ratios (N,)."""
-    delta_q = compute_delta_q(ratios, matrix.winners, matrix.losers, config.kl_coef)
-    if config.method is FinetuneMethod.DP_DPO:
-        return dp_dpo_loss(delta_q, matrix.weights, vote_temperature=config.vote_temperature)
-    if config.conservativeness is None:
-        raise LearningError("conservativeness is not set: estimate it from the labels first")
-    return rodif_loss(
-        delta_q,
+    """The configured loss as a function of all log-ratios (N,).
+
+    Raises UnknownNameError for a method without a loss of its own, and LearningError where a loss
+    needs a conservativeness that is not set.
+    """
+    return loss_of(config.method)(compare(ratios, matrix, config.kl_coef), config)
+
+
+def compare(ratios: Tensor, matrix: PairMatrix, kl_coef: float) -> Compared:
+    """What the losses look at, from the log-ratios (N,) and the reference's log-probabilities."""
+    log_probs = matrix.ref_log_probs + ratios
+    return Compared(
+        compute_delta_q(ratios, matrix.winners, matrix.losers, kl_coef),
         matrix.weights,
-        conservativeness=config.conservativeness,
-        vote_temperature=config.vote_temperature,
-        outer_temperature=config.outer_temperature,
-        vote_scale=config.vote_scale,
-        reduction=config.reduction,
-        group_size=config.group_size,
+        log_probs[matrix.winners],
+        log_probs[matrix.losers],
+        matrix.entries,
     )
 
 
@@ -209,8 +235,7 @@ def accumulate_gradient(
 def _ratio_chunk(
     policy: DiffusionPolicy, transitions: Transitions, a: int, b: int, config: FinetuneConfig
 ) -> Tensor:
-    size = policy.config
-    steps = size.executed_steps if config.executed_only else size.predicted_steps
+    steps = transitions.counted_steps(config)
     chain = transitions.chains[a:b]
     means = chain_means(policy.denoiser, policy.schedule, transitions.histories[a:b], chain)
     return log_prob_ratio(policy.schedule, chain, means, transitions.ref_means[a:b], steps)

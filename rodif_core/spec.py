@@ -43,6 +43,13 @@ class FinetuneMethod(StrEnum):
     RODIF_GUIDED = "rodif_guided"  # our default: RoDiF scores, guidance moves the policy
     RODIF = "rodif"  # the paper's robust loss (Eq. final_robust_loss)
     DP_DPO = "dp_dpo"  # the paper's baseline (Eq. dense_loss)
+    IPO = "ipo"  # its further baselines: identity preference optimisation (Azar et al., 2024)
+    CPO = "cpo"  # contrastive preference optimisation, with cloning (Xu et al., 2024)
+    SIMPO = "simpo"  # simple preference optimisation, with a margin (Meng et al., 2024)
+
+
+# Methods that run the RoDiF loss, whose threshold needs a conservativeness.
+GATED_METHODS = frozenset({FinetuneMethod.RODIF_GUIDED, FinetuneMethod.RODIF})
 
 
 class Reduction(StrEnum):
@@ -141,7 +148,8 @@ class GuideConfig(JsonConfig):
 class FinetuneConfig(JsonConfig):
     """Everything a fine-tuning round can be told; stored with the round.
 
-    Defaults are the paper's Avoid column (Table hyperparameters) where it gives a value.
+    Defaults are the paper's Avoid column (Table hyperparameters) where it gives a value. It gives
+    none for IPO, CPO and SimPO: theirs come from the papers that introduced them, untuned here.
     """
 
     method: FinetuneMethod = FinetuneMethod.RODIF_GUIDED
@@ -150,13 +158,17 @@ class FinetuneConfig(JsonConfig):
     outer_temperature: float = 1.0  # α of the outer sigmoid
     kl_coef: float = 0.1  # β
     vote_scale: float = 1.0  # ν ≈ 1
+    ipo_target: float = 0.5  # of ΔQ; Azar et al.'s 1 / (2τ) of a log-ratio with their τ = β
+    cpo_cloning_weight: float = 1.0  # per nat of -log π_θ(winner); Xu et al. weigh it like the rest
+    simpo_scale: float = 2.0  # per nat of a mean log-probability; Meng et al., Llama-3-Base
+    simpo_margin: float = 1.0  # of the scaled difference; the same
     reduction: Reduction = Reduction.SUM
     group_size: int = 64  # pairs per outer logistic when reduction = group
     step_pairing: StepPairing = StepPairing.SAME_INDEX
     matched_state_scale: float = 0.15  # length scale, normalised observation units
     executed_only: bool = False  # log-ratio over the executed part of the chunk only
     learning_rate: float = 3e-5
-    updates: int = 12  # full-batch updates of `rodif` and `dp_dpo`
+    updates: int = 12  # full-batch updates of every method but `rodif_guided`
     chunk_rows: int = 1024  # network rows per forward pass; memory only, not the result
     seed: int = 0
     guide: GuideConfig = field(default_factory=GuideConfig)
@@ -176,9 +188,7 @@ class FinetuneConfig(JsonConfig):
             gamma,
             "in [0, 1), or null to estimate it from the labels",
         )
-        for name in ("vote_temperature", "outer_temperature", "kl_coef", "vote_scale"):
-            value = getattr(self, name)
-            _require(math.isfinite(value) and value > 0, name, value, "a finite number above 0")
+        self._check_losses()
         _require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "in (0, 1]")
         _require(
             self.matched_state_scale > 0, "matched_state_scale", self.matched_state_scale, "> 0"
@@ -186,6 +196,16 @@ class FinetuneConfig(JsonConfig):
         for name in ("updates", "chunk_rows", "group_size"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         _require(0 <= self.seed <= LARGEST_SEED, "seed", self.seed, f"0 … {LARGEST_SEED}")
+
+    def _check_losses(self) -> None:
+        above = ("vote_temperature", "outer_temperature", "kl_coef", "vote_scale", "ipo_target")
+        for name in (*above, "simpo_scale"):
+            value = getattr(self, name)
+            _require(math.isfinite(value) and value > 0, name, value, "a finite number above 0")
+        for name in ("cpo_cloning_weight", "simpo_margin"):
+            value = getattr(self, name)
+            legal = "a finite number, at least 0"
+            _require(math.isfinite(value) and value >= 0, name, value, legal)
 
 
 # Where a task's rounds differ from the defaults. In Stacking many failures come of the policy's own

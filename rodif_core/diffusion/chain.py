@@ -91,10 +91,18 @@ def chain_log_prob(
 ) -> Tensor:
     """log π(a⁺ | s⁺) of Eq. policy-chain: sum over scored steps, chunk and action dims → (B,)."""
     means = chain_means(denoiser, schedule, history, chain)
+    return log_prob_of_chunk_steps(schedule, chain, means).sum(dim=1)
+
+
+def log_prob_of_chunk_steps(schedule: NoiseSchedule, chain: Tensor, means: Tensor) -> Tensor:
+    """log p(chain) in nats, split by steps of the chunk: their sum over all Tp is the whole.
+
+    chain (B, K + 1, Tp, A), means (B, S, Tp, A) of `chain_means`; returns (B, Tp).
+    """
     count = means.shape[1]
     std = schedule.std.to(chain)[list(schedule.scored_steps)].view(1, count, 1, 1)
     residual = (chain[:, 1 : count + 1] - means) / std
-    return (-0.5 * residual**2 - std.log() - LOG_SQRT_TWO_PI).sum(dim=(1, 2, 3))
+    return (-0.5 * residual**2 - std.log() - LOG_SQRT_TWO_PI).sum(dim=(1, 3))
 
 
 def log_prob_ratio(

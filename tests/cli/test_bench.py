@@ -17,6 +17,7 @@ from rodif_core.spec import FinetuneMethod, TaskName
 from worker.cli import bench
 from worker.cli.benchmarks import avoid
 from worker.cli.benchmarks.avoid import Run
+from worker.cli.main import build_parser
 
 GUIDED = FinetuneMethod.RODIF_GUIDED
 
@@ -60,10 +61,18 @@ def test_labels_have_the_exact_share_of_flips(
 
 
 def test_plan_measures_the_start_once_a_seed():
-    runs = avoid.plan([1, 2], ["product", "sparse"], [0.0, 0.3], list(FinetuneMethod), 200, None)
+    runs = avoid.plan([1, 2], ["product", "sparse"], [0.0, 0.3], avoid.METHODS, 200, None)
     assert len(runs) == 2 * (1 + 2 * 2 * 3)
     assert sum(run.method is None for run in runs) == 2
     assert len({run.key() for run in runs}) == len(runs)
+
+
+@pytest.mark.parametrize(
+    ("words", "methods"), [([], avoid.METHODS), (["--methods", "ipo", "cpo"], ("ipo", "cpo"))]
+)
+def test_further_baselines_run_on_request_only(words: list[str], methods: tuple[str, ...]):
+    args = build_parser().parse_args(["bench", "avoid", "--json", "out.json", *words])
+    assert tuple(args.methods) == methods
 
 
 def test_run_refuses_illegal_values():

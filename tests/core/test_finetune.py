@@ -1,4 +1,4 @@
-"""Scoring, guidance and the two fine-tuners, on hand-made chains."""
+"""Scoring, guidance, the literal fine-tuners and the guided one, on hand-made chains."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from rodif_core.finetune import finetune
 from rodif_core.guidance import guidance_target, guide
 from rodif_core.guided import decisions_done, near_data
 from rodif_core.log_ratio import PairMatrix, Transitions
+from rodif_core.losses import LOSSES
 from rodif_core.preferences.pairs import Preference, Tie
 from rodif_core.scoring import TIE_SD, PathFeatures, PathUtility, split_threshold, standardise
-from rodif_core.spec import FinetuneConfig, FinetuneMethod, GuideConfig
+from rodif_core.spec import GATED_METHODS, FinetuneConfig, FinetuneMethod, GuideConfig
 from rodif_core.tasks import get_task
 from tests.core.learning import chain_trajectory, tiny_checkpoint, tiny_policy
 
@@ -39,7 +40,10 @@ def labelled_trajectories() -> list:
     return [chain_trajectory(policy, 3, seed=i, x=x + 0.01 * i) for i, x in enumerate(sides)]
 
 
-@pytest.mark.parametrize("method", [FinetuneMethod.RODIF, FinetuneMethod.DP_DPO])
+for_every_literal_method = pytest.mark.parametrize("method", list(LOSSES))
+
+
+@for_every_literal_method
 def test_literal_fine_tuner_raises_the_mean_vote(method: FinetuneMethod) -> None:
     config = replace(RODIF, method=method)
     report = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config).report
@@ -49,16 +53,34 @@ def test_literal_fine_tuner_raises_the_mean_vote(method: FinetuneMethod) -> None
     assert report["kl_winners"] > 0
 
 
-def test_equal_arguments_give_equal_weights() -> None:
+@for_every_literal_method
+def test_equal_arguments_give_equal_weights(method: FinetuneMethod) -> None:
+    config = replace(RODIF, method=method)
     results = [
-        finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF).checkpoint.digest
+        finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config).checkpoint.digest
         for _ in range(2)
     ]
     assert results[0] == results[1]
 
 
-def test_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
-    whole = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF)
+@pytest.mark.parametrize("method", [name for name in LOSSES if name not in GATED_METHODS])
+def test_loss_without_a_gate_needs_no_conservativeness_and_does_all_updates(
+    method: FinetuneMethod,
+) -> None:
+    weights = []
+    for gamma in (None, 0.9):  # a γ at which RoDiF's gradient is dead
+        config = replace(RODIF, method=method, conservativeness=gamma, updates=3)
+        result = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config)
+        assert result.report["stopped"] == "all updates done"
+        assert len(result.report["curve"]) == 3
+        weights.append(result.checkpoint.policy.denoiser.state_dict())
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+@for_every_literal_method
+def test_killed_run_goes_on_to_the_same_weights(method: FinetuneMethod, tmp_path: Path) -> None:
+    config = replace(RODIF, method=method)
+    whole = finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config)
 
     class KilledError(Exception):
         pass
@@ -67,7 +89,7 @@ def test_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
         if fraction > 0.9:
             raise KilledError
 
-    arguments = (tiny_checkpoint(), labelled_trajectories(), CROSS, RODIF)
+    arguments = (tiny_checkpoint(), labelled_trajectories(), CROSS, config)
     with pytest.raises(KilledError):
         finetune(*arguments, workspace=tmp_path, progress=kill)
     assert list(tmp_path.iterdir()), "the partial state was written"
@@ -122,11 +144,11 @@ def test_dead_gradient_is_reported_and_trains_nothing() -> None:
         assert torch.equal(after, before)
 
 
-def test_missing_conservativeness_is_refused() -> None:
+@pytest.mark.parametrize("method", sorted(GATED_METHODS))
+def test_missing_conservativeness_is_refused(method: FinetuneMethod) -> None:
+    config = replace(RODIF, method=method, conservativeness=None)
     with pytest.raises(LearningError, match="estimate it from the labels"):
-        finetune(
-            tiny_checkpoint(), labelled_trajectories(), CROSS, replace(RODIF, conservativeness=None)
-        )
+        finetune(tiny_checkpoint(), labelled_trajectories(), CROSS, config)
 
 
 def test_preference_outside_the_trajectories_is_named() -> None:

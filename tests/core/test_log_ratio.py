@@ -7,19 +7,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rodif_core.errors import LearningError
+from rodif_core.diffusion.chain import chain_log_prob, chain_means, log_prob_of_chunk_steps
+from rodif_core.errors import LearningError, UnknownNameError
 from rodif_core.log_ratio import (
     PairMatrix,
     Transitions,
     accumulate_gradient,
+    compare,
     compute_ratios,
     preference_loss,
 )
+from rodif_core.losses import LOSSES
+from rodif_core.policies.policy import DiffusionPolicy
 from rodif_core.preferences.pairs import Preference
 from rodif_core.spec import FinetuneConfig, FinetuneMethod, Reduction, StepPairing
 from tests.core.learning import chain_trajectory, tiny_policy
 
-CONFIG = FinetuneConfig(conservativeness=0.3, chunk_rows=8)
+CONFIG = FinetuneConfig(method=FinetuneMethod.RODIF, conservativeness=0.3, chunk_rows=8)
 PREFERENCES = [Preference(0, 1), Preference(2, 1), Preference(0, 3)]
 
 
@@ -47,7 +51,9 @@ def double_batch(config: FinetuneConfig) -> tuple:
             transitions, histories=transitions.histories.double(),
             chains=transitions.chains.double(), ref_means=transitions.ref_means.double(),
         ),
-        replace(matrix, weights=matrix.weights.double()),
+        replace(
+            matrix, weights=matrix.weights.double(), ref_log_probs=matrix.ref_log_probs.double()
+        ),
     )  # fmt: skip
 
 
@@ -63,23 +69,87 @@ def test_ratios_are_exactly_zero_and_votes_one_half_at_the_reference(chunk_rows:
     assert preference_loss(ratios, matrix, config).metrics["mean_vote"] == 0.5
 
 
-@pytest.mark.parametrize("method", [FinetuneMethod.RODIF, FinetuneMethod.DP_DPO])
-@pytest.mark.parametrize("reduction", list(Reduction))
-def test_chunked_gradient_equals_the_plain_one(
-    method: FinetuneMethod, reduction: Reduction
+def gradient(policy: DiffusionPolicy) -> torch.Tensor:
+    """All gradients of the network as one row; they are taken away."""
+    parts = [value.grad.flatten() for value in policy.denoiser.parameters()]
+    policy.denoiser.zero_grad(set_to_none=True)
+    return torch.cat(parts)
+
+
+ALL_LOSSES = [(method, Reduction.SUM) for method in LOSSES]
+ALL_LOSSES += [(FinetuneMethod.RODIF, Reduction.MEAN), (FinetuneMethod.RODIF, Reduction.GROUP)]
+
+
+@pytest.mark.parametrize("executed_only", [False, True])
+@pytest.mark.parametrize(("method", "reduction"), ALL_LOSSES)
+def test_chunked_gradient_equals_that_of_one_backward_pass(
+    method: FinetuneMethod, reduction: Reduction, executed_only: bool
 ) -> None:
-    config = replace(CONFIG, method=method, reduction=reduction, group_size=2)
+    config = replace(
+        CONFIG, method=method, reduction=reduction, group_size=2, executed_only=executed_only
+    )
     moved, transitions, matrix = double_batch(config)
     gradients = []
-    for rows in (4, 1_000_000):
-        moved.denoiser.zero_grad(set_to_none=True)
-        accumulate_gradient(
+    for rows in (4, 13):
+        told = accumulate_gradient(
             moved, transitions, replace(config, chunk_rows=rows),
             lambda ratios: preference_loss(ratios, matrix, config),
-        )  # fmt: skip
-        gradients.append(torch.cat([value.grad.flatten() for value in moved.denoiser.parameters()]))
-    assert float(gradients[0].abs().max()) > 0
-    assert torch.allclose(gradients[0], gradients[1], rtol=1e-9, atol=1e-12)
+        ).loss  # fmt: skip
+        gradients.append(gradient(moved))
+    # The plain way: log π_θ of whole chains with their graph, from the densities themselves.
+    chains, count = transitions.chains, transitions.counted_steps(config)
+    means = chain_means(moved.denoiser, moved.schedule, transitions.histories, chains)
+    log_probs, reference = (
+        log_prob_of_chunk_steps(moved.schedule, chains, some)[:, :count].sum(dim=1)
+        for some in (means, transitions.ref_means)
+    )
+    loss = preference_loss(log_probs - reference, matrix, config).loss
+    loss.backward()
+    plain = gradient(moved)
+    assert float(plain.abs().max()) > 0
+    assert float(told) == pytest.approx(float(loss.detach()), rel=1e-9)
+    for chunked in gradients:
+        assert torch.allclose(chunked, plain, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize(("executed_only", "steps"), [(False, 8), (True, 4)])
+def test_reference_free_losses_get_the_log_probabilities_of_the_chains(
+    executed_only: bool, steps: int
+) -> None:
+    config = replace(CONFIG, executed_only=executed_only)
+    moved, transitions, matrix = double_batch(config)
+    means = chain_means(
+        moved.denoiser, moved.schedule, transitions.histories, transitions.chains
+    ).detach()
+    expected = log_prob_of_chunk_steps(moved.schedule, transitions.chains, means)
+    expected = expected[:, :steps].sum(dim=1)
+    compared = compare(compute_ratios(moved, transitions, config), matrix, config.kl_coef)
+    assert torch.allclose(compared.winner_log_probs, expected[matrix.winners])
+    assert torch.allclose(compared.loser_log_probs, expected[matrix.losers])
+    # K = 5 without k = 1, chunk steps, two dims of the action.
+    assert compared.entries == 4 * steps * 2
+    if not executed_only:
+        whole = chain_log_prob(
+            moved.denoiser, moved.schedule, transitions.histories, transitions.chains
+        )
+        assert torch.allclose(expected, whole)
+
+
+def test_cached_log_probabilities_are_the_references() -> None:
+    reference, _, transitions = batch()
+    whole = chain_log_prob(
+        reference.denoiser, reference.schedule, transitions.histories, transitions.chains
+    )
+    assert torch.allclose(transitions.ref_log_probs.sum(dim=1), whole, rtol=1e-5)
+
+
+def test_method_without_a_loss_of_its_own_is_named() -> None:
+    _, _, transitions = batch()
+    matrix = PairMatrix.build(transitions, PREFERENCES, CONFIG)
+    with pytest.raises(UnknownNameError, match="loss 'rodif_guided'.*'rodif', 'dp_dpo', 'ipo'"):
+        preference_loss(
+            torch.zeros(12), matrix, replace(CONFIG, method=FinetuneMethod.RODIF_GUIDED)
+        )
 
 
 def test_accumulated_gradient_equals_finite_differences_in_a_parameter_direction() -> None:

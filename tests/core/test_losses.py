@@ -1,4 +1,4 @@
-"""The paper's losses: numbers worked by hand, symmetries, limits, dead gradients."""
+"""The losses: numbers worked by hand, symmetries, limits, dead gradients, a contract for all."""
 
 from __future__ import annotations
 
@@ -9,9 +9,20 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rodif_core.errors import LearningError, ValueOutOfRangeError
-from rodif_core.losses import compute_delta_q, dp_dpo_loss, rodif_loss
-from rodif_core.spec import Reduction
+from rodif_core.errors import LearningError, UnknownNameError, ValueOutOfRangeError
+from rodif_core.losses import (
+    LOSSES,
+    Compared,
+    LossOutput,
+    compute_delta_q,
+    cpo_loss,
+    dp_dpo_loss,
+    ipo_loss,
+    loss_of,
+    rodif_loss,
+    simpo_loss,
+)
+from rodif_core.spec import GATED_METHODS, FinetuneConfig, FinetuneMethod, Reduction
 
 PLAIN = {"vote_temperature": 1.0, "outer_temperature": 1.0, "vote_scale": 1.0}
 
@@ -29,6 +40,27 @@ WINNERS = torch.tensor([[0, 1], [2, 3]])
 LOSERS = torch.tensor([[2, 4], [0, 4]])
 HALF = torch.tensor([[1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
 ONES = torch.ones(2, 2, dtype=torch.float64)
+# log π_θ of the same steps: log π_w - log π_l = [[2, -1], [-2, 1]], over D = 4 numbers each.
+COMPARED = Compared(
+    HALF,
+    ONES,
+    torch.tensor([[-1.0, -2.0], [-3.0, -1.0]], dtype=torch.float64),
+    torch.tensor([[-3.0, -1.0], [-1.0, -2.0]], dtype=torch.float64),
+    entries=4,
+)
+CONFIG = FinetuneConfig(conservativeness=0.3, vote_temperature=0.8)
+for_every_method = pytest.mark.parametrize("method", list(LOSSES))
+
+
+def drawn(seed: int, pairs: int = 3, steps: int = 4) -> Compared:
+    """Random steps: ΔQ, weights in (0, 1), log-probabilities around -5 nats."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (pairs, steps)
+    delta_q, winner, loser = (
+        torch.randn(shape, generator=generator, dtype=torch.float64) for _ in range(3)
+    )
+    weights = torch.rand(shape, generator=generator, dtype=torch.float64) + 1e-3
+    return Compared(delta_q, weights, winner - 5, loser - 5, 6)
 
 
 def test_delta_q_is_the_scaled_difference_of_log_ratios() -> None:
@@ -90,17 +122,126 @@ def test_zero_weight_removes_a_cell_from_votes_and_threshold() -> None:
     assert float(dpo) == pytest.approx(-math.log(sigma(1) * sigma(-1) * sigma(1)))
 
 
-@given(st.integers(0, 2**31))
-def test_losses_do_not_change_when_pairs_are_permuted(seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    delta_q = torch.randn(6, 3, generator=generator, dtype=torch.float64)
-    order = torch.randperm(6, generator=generator)
-    ones = torch.ones_like(delta_q)
-    for loss in (
-        lambda d: dp_dpo_loss(d, ones, vote_temperature=0.7).loss,
-        lambda d: rodif_loss(d, ones, conservativeness=0.3, **PLAIN).loss,
-    ):
-        assert float(loss(delta_q)) == pytest.approx(float(loss(delta_q[order])))
+def test_ipo_matches_hand_worked_number() -> None:
+    # Σ (ΔQ - 0.5)² = 2 * 0.5² + 2 * 1.5² = 0.5 + 4.5
+    output = ipo_loss(HALF, ONES, target=0.5, vote_temperature=1.0)
+    assert float(output.loss) == pytest.approx(5.0)
+    assert output.metrics["mean_vote"] == pytest.approx(0.5)
+
+
+def test_cpo_matches_hand_worked_number() -> None:
+    # β = 0.5 on the differences: [[1, -0.5], [-1, 0.5]]. -Σ log σ = 0.3132617 + 0.9740770
+    # + 1.3132617 + 0.4740770 = 3.0746774. Cloning: 0.1 * (1 + 2 + 3 + 1) = 0.7.
+    output = cpo_loss(COMPARED, kl_coef=0.5, vote_temperature=1.0, cloning_weight=0.1)
+    assert float(output.loss) == pytest.approx(3.7746774, abs=1e-6)
+    # α = 0.5 doubles the differences: -log σ of ±2 and ±1, and leaves the cloning alone.
+    output = cpo_loss(COMPARED, kl_coef=0.5, vote_temperature=0.5, cloning_weight=0.1)
+    expected = -math.log(sigma(2) * sigma(-1) * sigma(-2) * sigma(1)) + 0.7
+    assert float(output.loss) == pytest.approx(expected)
+
+
+def test_simpo_matches_hand_worked_number() -> None:
+    # scale / D = 2 / 4 on the differences: [[1, -0.5], [-1, 0.5]]; less the margin 1:
+    # [[0, -1.5], [-2, -0.5]]. -Σ log σ = 0.6931472 + 1.7014133 + 2.1269280 + 0.9740770
+    output = simpo_loss(COMPARED, scale=2.0, margin=1.0, vote_temperature=1.0)
+    assert float(output.loss) == pytest.approx(5.4955655, abs=1e-6)
+
+
+@given(st.floats(-30, 30), st.floats(0.01, 5))
+def test_ipo_pulls_every_step_to_its_target_and_not_beyond(value: float, target: float) -> None:
+    delta_q = torch.tensor([[value]], dtype=torch.float64, requires_grad=True)
+    loss = ipo_loss(delta_q, torch.ones_like(delta_q), target=target, vote_temperature=1.0).loss
+    (slope,) = torch.autograd.grad(loss, delta_q)
+    assert float(slope) == pytest.approx(2 * (value - target), abs=1e-9)
+
+
+@given(st.integers(0, 2**31), st.floats(-20, 0))
+def test_cpo_without_cloning_is_dp_dpo_with_a_uniform_reference(seed: int, level: float) -> None:
+    some = drawn(seed)
+    # π_ref is e^level everywhere, so that log-ratio = log π_θ - level.
+    delta_q = 0.3 * ((some.winner_log_probs - level) - (some.loser_log_probs - level))
+    dpo = dp_dpo_loss(delta_q, some.weights, vote_temperature=0.8).loss
+    cpo = cpo_loss(some, kl_coef=0.3, vote_temperature=0.8, cloning_weight=0.0).loss
+    assert float(cpo) == pytest.approx(float(dpo))
+
+
+def test_cloning_pulls_winners_alone_and_each_by_its_weight() -> None:
+    some = drawn(5)
+    winners = some.winner_log_probs.clone().requires_grad_()
+    losers = some.loser_log_probs.clone().requires_grad_()
+
+    def slopes(weight: float) -> tuple[torch.Tensor, ...]:
+        moving = some._replace(winner_log_probs=winners, loser_log_probs=losers)
+        loss = cpo_loss(moving, kl_coef=0.1, vote_temperature=1.0, cloning_weight=weight).loss
+        return torch.autograd.grad(loss, (winners, losers))
+
+    without, cloned = slopes(0.0), slopes(0.7)
+    assert torch.allclose(cloned[0], without[0] - 0.7 * some.weights)
+    assert torch.equal(cloned[1], without[1])
+
+
+@given(st.integers(0, 2**31), st.integers(2, 50))
+def test_simpo_sees_the_mean_over_a_chains_numbers(seed: int, times: int) -> None:
+    some = drawn(seed)
+    longer = some._replace(
+        winner_log_probs=times * some.winner_log_probs,
+        loser_log_probs=times * some.loser_log_probs,
+        entries=times * some.entries,
+    )
+    losses = [
+        float(simpo_loss(one, scale=2.0, margin=0.5, vote_temperature=1.0).loss)
+        for one in (some, longer)
+    ]
+    assert losses[0] == pytest.approx(losses[1])
+
+
+def test_every_method_but_the_guided_one_has_a_loss() -> None:
+    assert set(LOSSES) == set(FinetuneMethod) - {FinetuneMethod.RODIF_GUIDED}
+    with pytest.raises(UnknownNameError, match="loss 'rodif_guided'; legal values are 'rodif', "):
+        loss_of(FinetuneMethod.RODIF_GUIDED)
+
+
+@for_every_method
+def test_loss_and_votes_are_told_and_a_gate_only_by_a_loss_that_has_one(
+    method: FinetuneMethod,
+) -> None:
+    output = LOSSES[method](COMPARED, CONFIG)
+    assert output.loss.shape == ()
+    assert output.metrics["loss"] == float(output.loss)
+    # A word means one thing: votes are σ(ΔQ / α) whatever the loss looks at.
+    assert output.metrics["mean_vote"] == pytest.approx(0.5)
+    assert output.metrics["outvoted"] == 0.0
+    gate = {"gate_margin", "outer_slope"} & set(output.metrics)
+    assert gate == ({"gate_margin", "outer_slope"} if method in GATED_METHODS else set())
+
+
+@pytest.mark.parametrize("method", [name for name in LOSSES if name in GATED_METHODS])
+def test_gated_loss_without_a_conservativeness_says_what_to_do(method: FinetuneMethod) -> None:
+    with pytest.raises(LearningError, match="estimate it from the labels"):
+        LOSSES[method](COMPARED, FinetuneConfig())
+
+
+def shuffled(some: Compared, order: torch.Tensor) -> Compared:
+    return Compared(*(matrix[order] for matrix in some[:4]), some.entries)
+
+
+@for_every_method
+@given(seed=st.integers(0, 2**31))
+def test_losses_do_not_change_when_pairs_are_permuted(method: FinetuneMethod, seed: int) -> None:
+    some = drawn(seed, 6, 3)
+    order = torch.randperm(6, generator=torch.Generator().manual_seed(seed))
+    losses = [float(LOSSES[method](one, CONFIG).loss) for one in (some, shuffled(some, order))]
+    assert losses[0] == pytest.approx(losses[1])
+
+
+@for_every_method
+def test_what_has_no_weight_does_not_count(method: FinetuneMethod) -> None:
+    some = drawn(1)
+    some.weights[1, 2] = 0.0
+    other = Compared(*(matrix.clone() for matrix in some[:4]), some.entries)
+    for matrix in (other.delta_q, other.winner_log_probs, other.loser_log_probs):
+        matrix[1, 2] += 7.0
+    assert float(LOSSES[method](some, CONFIG).loss) == float(LOSSES[method](other, CONFIG).loss)
 
 
 @given(st.integers(0, 2**31))
@@ -123,18 +264,18 @@ def test_delta_q_ignores_a_constant_added_to_all_log_ratios(seed: int, shift: fl
     assert torch.allclose(before, after, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["rodif", "dp_dpo"])
-def test_gradient_equals_finite_differences(method: str) -> None:
-    generator = torch.Generator().manual_seed(3)
-    delta_q = torch.randn(3, 4, generator=generator, dtype=torch.float64, requires_grad=True)
-    weights = torch.rand(3, 4, generator=generator, dtype=torch.float64)
+@for_every_method
+def test_gradient_equals_finite_differences(method: FinetuneMethod) -> None:
+    some = drawn(3)
+    inputs = (some.delta_q, some.winner_log_probs, some.loser_log_probs)
+    for matrix in inputs:
+        matrix.requires_grad_()
 
-    def loss(values: torch.Tensor) -> torch.Tensor:
-        if method == "dp_dpo":
-            return dp_dpo_loss(values, weights, vote_temperature=0.8).loss
-        return rodif_loss(values, weights, conservativeness=0.4, **PLAIN).loss
+    def loss(*moving: torch.Tensor) -> torch.Tensor:
+        delta_q, winner, loser = moving
+        return LOSSES[method](Compared(delta_q, some.weights, winner, loser, 6), CONFIG).loss
 
-    assert torch.autograd.gradcheck(loss, (delta_q,))
+    assert torch.autograd.gradcheck(loss, inputs)
 
 
 @pytest.mark.parametrize("gamma", [-0.1, 1.0, 1.5, math.nan])
@@ -152,6 +293,16 @@ def test_outer_slope_is_dead_when_gamma_passes_one_half_under_the_sum() -> None:
     assert dead < 1e-15
 
 
-def test_loss_without_any_comparable_step_is_refused() -> None:
+@for_every_method
+def test_loss_without_any_comparable_step_is_refused(method: FinetuneMethod) -> None:
     with pytest.raises(LearningError, match="all weights are 0"):
-        dp_dpo_loss(HALF, torch.zeros_like(ONES), vote_temperature=1.0)
+        LOSSES[method](COMPARED._replace(weights=torch.zeros_like(ONES)), CONFIG)
+
+
+@for_every_method
+def test_weights_of_another_shape_are_named(method: FinetuneMethod) -> None:
+    def loss() -> LossOutput:
+        return LOSSES[method](COMPARED._replace(weights=torch.ones(2, 3)), CONFIG)
+
+    with pytest.raises(ValueOutOfRangeError, match=r"shape of weights is \(2, 3\).*\(2, 2\)"):
+        loss()

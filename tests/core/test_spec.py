@@ -36,6 +36,14 @@ def test_config_survives_json(config: FinetuneConfig | RolloutConfig) -> None:
     assert type(config).from_json(json.loads(json.dumps(config.to_json()))) == config
 
 
+def test_configuration_of_a_round_from_before_a_loss_has_its_defaults() -> None:
+    # What a round stored when `rodif`, `dp_dpo` and `rodif_guided` were all there was.
+    stored = FinetuneConfig(method="dp_dpo", updates=3, kl_coef=0.2).to_json()
+    for name in ("ipo_target", "cpo_cloning_weight", "simpo_scale", "simpo_margin"):
+        del stored[name]
+    assert FinetuneConfig.from_json(stored) == FinetuneConfig("dp_dpo", updates=3, kl_coef=0.2)
+
+
 @pytest.mark.parametrize("gamma", [-0.01, 1.0, 2.0, math.nan, math.inf])
 def test_gamma_outside_its_range_names_value_and_range(gamma: float) -> None:
     with pytest.raises(ValueOutOfRangeError, match=r"conservativeness is .*in \[0, 1\)"):
@@ -97,6 +105,12 @@ def test_unknown_field_lists_the_legal_ones() -> None:
         ("group_size", 0),
         ("seed", -1),
         ("matched_state_scale", 0.0),
+        ("ipo_target", 0.0),
+        ("cpo_cloning_weight", -0.1),
+        ("cpo_cloning_weight", math.nan),
+        ("simpo_scale", 0.0),
+        ("simpo_margin", -0.1),
+        ("simpo_margin", math.inf),
     ],
 )
 def test_finetune_value_out_of_range_is_named(field: str, value: float) -> None:

@@ -78,7 +78,11 @@ def test_annotators_are_told_of_no_policy_and_no_preferred_behaviour(sqlite_worl
         ({"task": "juggling"}, 422, ["'juggling'", "'avoid'"]),
         ({"start_checkpoint_id": 99}, 404, ["no checkpoint 99"]),
         ({"name": ""}, 422, ["body.name"]),
-        ({"settings": {"method": "magic"}}, 422, ["'rodif_guided', 'rodif' or 'dp_dpo'"]),
+        (
+            {"settings": {"method": "magic"}},
+            422,
+            ["'rodif_guided', 'rodif', 'dp_dpo', 'ipo', 'cpo' or 'simpo'"],
+        ),
         ({"settings": {"labels_per_pair": 0}}, 422, ["greater than or equal to 1"]),
         ({"settings": {"collect": {"strategy": "best"}}}, 422, ["'cross_group' or 'random'"]),
         ({"settings": {"publish_rule": "maybe"}}, 422, ["'auto', 'manual' or 'never'"]),

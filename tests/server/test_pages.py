@@ -8,6 +8,7 @@ import re
 
 import pytest
 
+from rodif_core.spec import FinetuneMethod
 from server.store.tables import Pair
 from tests.server.world import World
 
@@ -24,6 +25,13 @@ def test_strangers_are_sent_to_sign_in_and_back(sqlite_world: World, path: str) 
 def test_what_an_address_asks_for_survives_the_sign_in(sqlite_world: World) -> None:
     answer = sqlite_world.browser().get("/label/1?view=top&x=a b", follow_redirects=False)
     assert answer.headers["location"] == "/sign-in?next=/label/1%3Fview%3Dtop%26x%3Da%2520b"
+
+
+@pytest.mark.parametrize("method", FinetuneMethod)
+def test_the_dialogs_offer_every_method(sqlite_world: World, method: FinetuneMethod) -> None:
+    script = sqlite_world.signed_in("ada").get("/static/campaign-actions.js").text
+    offered = script.partition("const METHODS = [")[2].partition("];")[0]
+    assert f'["{method}", "' in offered
 
 
 @pytest.mark.parametrize(("name", "home"), [("ada", "/admin"), ("ann", "/label")])

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from rodif_core.spec import FinetuneMethod
 from server import publications, rounds
 from server.states import JobKind, JobState, PublishRule, RoundState
 from server.store.tables import Campaign, Checkpoint, Event, Job, Publication, Round
@@ -64,6 +65,18 @@ def test_round_goes_from_labels_to_a_decision(world: World) -> None:
     assert states == ["queued", "finetuning", "evaluating", "gating", row.state]
     curve = [e.data for e in world.rows(Event) if e.kind == "curve"]
     assert curve and all({"stage", "fraction"} <= set(point) for point in curve)
+
+
+@pytest.mark.parametrize("method", [FinetuneMethod.IPO, FinetuneMethod.CPO, FinetuneMethod.SIMPO])
+def test_round_by_a_further_baseline_makes_a_candidate(
+    world: World, method: FinetuneMethod
+) -> None:
+    round_id = world.launch(PublishRule.NEVER, method=method)
+    assert _run(world, JobKind.FINETUNE, round_id) == JobState.DONE
+    (candidate,) = _candidates(world)
+    assert candidate.parent_id == world.checkpoint_id
+    report = candidate.metrics["finetune"]
+    assert (report["method"], report["stopped"]) == (method, "all updates done")
 
 
 def test_nothing_changes_when_the_jobs_of_a_round_come_twice(world: World) -> None:

@@ -162,10 +162,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="shares of flipped labels (default 0 0.2 0.3 0.4)",
     )
     fine.add_argument("--designs", nargs="+", choices=avoid.DESIGNS, default=list(avoid.DESIGNS))
-    methods = [method.value for method in FinetuneMethod]
-    fine.add_argument("--methods", nargs="+", choices=methods, default=methods)
+    fine.add_argument(
+        "--methods",
+        nargs="+",
+        choices=[method.value for method in FinetuneMethod],
+        default=[method.value for method in avoid.METHODS],
+        help=f"(default {' '.join(avoid.METHODS)})",
+    )
     fine.add_argument("--n", type=int, default=200, help="rollouts a row (default %(default)s)")
-    fine.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
+    fine.add_argument("--updates", type=int, help="full-batch updates of the literal methods")
     fine.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
     timing = kinds.add_parser("rollouts", help="how quick rollouts are")
     timing.add_argument("--json", type=Path, help="file of rows to write")

@@ -73,7 +73,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="first seed of the evaluation; default: one that all rounds share, above those of the"
         " rollouts that are labelled",
     )
-    parser.add_argument("--updates", type=int, help="full-batch updates of rodif and dp_dpo")
+    parser.add_argument("--updates", type=int, help="full-batch updates of the literal methods")
     parser.add_argument(
         "--conservativeness", type=float, help="γ in [0, 1); default: estimated from the labels"
     )

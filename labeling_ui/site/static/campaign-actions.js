@@ -9,6 +9,9 @@ const METHODS = [
   ["rodif_guided", "rodif_guided: RoDiF scores, guidance moves the policy"],
   ["rodif", "rodif: the paper’s robust loss"],
   ["dp_dpo", "dp_dpo: the paper’s baseline"],
+  ["ipo", "ipo: pulls ΔQ to a target"],
+  ["cpo", "cpo: no reference, clones winners"],
+  ["simpo", "simpo: no reference, wants a margin"],
 ];
 const RULES = [
   ["auto", "Publish when the gate passes"], ["manual", "Wait for an admin"], ["never", "Comparison only"],

@@ -33,7 +33,8 @@ function layout(title, axis) {
 }
 
 // Points of one stage become one line, in the order in which they came. `relative`: as a share of
-// the line's first value, because the losses of different stages differ by orders of magnitude.
+// the line's first value, because the losses of different stages differ by orders of magnitude; one
+// that begins below 0 (log-probabilities of densities) still falls as it gets better.
 function traces(points, value, colours, { relative = false } = {}) {
   const stages = new Map();
   for (const point of points) {
@@ -44,7 +45,7 @@ function traces(points, value, colours, { relative = false } = {}) {
   return [...stages].map(([stage, values], index) => ({
     type: "scatter", mode: values.length > 1 ? "lines" : "markers", name: stage,
     x: values.map((_, step) => step + 1),
-    y: relative ? values.map((one) => one / (values[0] || 1)) : values,
+    y: relative ? values.map((one) => one / Math.abs(values[0] || 1)) : values,
     text: values.map((one) => one.toPrecision(4)),
     hovertemplate: "%{text}",
     line: { width: 2, color: colours[index % colours.length] },

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from rodif_core.trajectory import Trajectory
 
 DESIGNS = ("product", "sparse")
+# What is compared unless methods are named; the paper's further baselines run on request.
+METHODS = (FinetuneMethod.RODIF_GUIDED, FinetuneMethod.RODIF, FinetuneMethod.DP_DPO)
 WINNERS = LOSERS = 20
 SPARSE_PAIRS = 60
 ANNOTATORS = 5  # who "gave" the labels, in turn; only the noise estimate looks at it
@@ -50,7 +52,7 @@ class Run:
     corruption: float
     method: FinetuneMethod | None
     episodes: int
-    updates: int | None = None  # full-batch updates of rodif and dp_dpo; None: the default
+    updates: int | None = None  # full-batch updates of the literal methods; None: the default
 
     def __post_init__(self) -> None:
         if self.design not in DESIGNS and self.method is not None:
