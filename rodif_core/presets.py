@@ -40,6 +40,7 @@ class PretrainConfig:
     rounds: int = 0  # of training on, also on what experts did after they took over
     recoveries: int = 300  # takeovers tried a round
     drives: int = 1  # rollouts for each of them; from 2 on, failures and every group get as many
+    steered_drives: int = 0  # further rollouts for each, by copies that each go one group's way
     round_updates: int = 8_000
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
@@ -56,7 +57,7 @@ class PretrainConfig:
         if not 0 <= self.ema_decay < 1:
             raise ValueOutOfRangeError("ema_decay", self.ema_decay, "in [0, 1)")
         least = {"updates": 1, "round_updates": 1, "recoveries": 1, "drives": 1}
-        least |= {"rounds": 0, "batch_size": 1}
+        least |= {"rounds": 0, "batch_size": 1, "steered_drives": 0}
         if self.looks < 0 or (self.looks and self.begin_with is None):
             legal = "at least 0, and 0 without a policy to begin with"
             raise ValueOutOfRangeError("looks", self.looks, legal)

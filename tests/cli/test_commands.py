@@ -15,10 +15,11 @@ from PIL import Image
 from rich.console import Console
 
 from labeling_ui.mode_plot import GROUP_COLOURS
-from rodif_core import shipped
+from rodif_core import shipped, steered
 from rodif_core.demonstrations import load_demonstrations
 from rodif_core.policies.checkpoint import load_checkpoint, save_checkpoint
 from rodif_core.presets import PRESETS
+from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import TaskName
 from rodif_core.training_state import Precision
 from tests.core.learning import tiny_checkpoint
@@ -153,7 +154,46 @@ def test_pretrain_trains_again_on_what_the_expert_did_after_taking_over(tmp_path
     assert made.card["held_out_curve"][-1]["update"] == 2  # the last of three
 
 
-@pytest.mark.parametrize("option", ["--rounds", "--track", "--evaluate"])
+@pytest.mark.slow
+def test_pretrain_goes_on_from_a_file_with_takeovers_from_steered_copies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(steered, "UPDATES", 2)
+    before, file = tmp_path / "before.safetensors", tmp_path / "after.safetensors"
+    before.write_bytes(shipped_checkpoint(TaskName.AVOID))
+    sizes = ["--demonstrations", "4", "--track", "0", "--evaluate", "0"]
+    rounds = ["--rounds", "1", "--recoveries", "4", "--steered-drives", "2", "--round-updates", "3"]
+    work = tmp_path / "work"
+    arguments = [*sizes, *rounds, "--begin-with", str(before), "--workspace", str(work)]
+    assert main(["pretrain", "avoid", "--out", str(file), *arguments]) == 0
+    made, begun = load_checkpoint(file.read_bytes()), load_checkpoint(before.read_bytes())
+    assert made.card["start"] == begun.digest
+    assert made.card["preset"]["steered_drives"] == 2
+    assert len(made.card["success_before_rounds"]) == 1
+    taken = load_demonstrations(work / "round-0" / "recoveries-4x1+2.npz")
+    assert 1 <= made.card["recoveries"] == len(taken) <= 4
+    assert {one.info["checkpoint"] for one in taken} - {begun.digest}  # a copy drove, too
+
+
+@pytest.mark.parametrize(
+    ("task", "rounds", "message"),
+    [
+        ("pushing", "1", "is a policy of task 'avoid', but must be of 'pushing'"),
+        ("aligning", "1", "but must be of 'aligning' or 'aligning-state'"),
+        ("avoid", "0", "with 0 rounds trains nothing"),
+    ],
+)
+def test_pretrain_tells_what_it_cannot_begin_with(
+    task: str, rounds: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = tmp_path / "before.safetensors"
+    before.write_bytes(shipped_checkpoint(TaskName.AVOID))
+    arguments = ["--begin-with", str(before), "--rounds", rounds, "--out", str(tmp_path / "x")]
+    assert main(["pretrain", task, *arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--rounds", "--track", "--evaluate", "--steered-drives"])
 def test_pretrain_refuses_negative_numbers(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -37,7 +37,7 @@ CONFIG = replace(
 def trained(workspace: Path, demos: Path | None = None, **changes: Any) -> Checkpoint:
     args = argparse.Namespace(
         task=TASK.value, demos=demos, demonstrations=4, preferred_share=None, seed=0, device="cpu",
-        precision=None, workspace=workspace, track=0, processes=1,
+        precision=None, workspace=workspace, track=0, processes=1, begin_with=None,
     )  # fmt: skip
     with Progress(disable=True) as bar:
         return pretrain._train(args, replace(CONFIG, **changes), bar)
@@ -87,7 +87,7 @@ def test_a_set_has_rounds_only_where_they_are_asked_for(tmp_path: Path):
     save_demonstrations(file, make_demonstrations(get_task("sorting"), episodes=3, seed=2))
     preset = preset_for(TaskName.SORTING, "cpu")
     wishes = {"task": "sorting", "preset": "cpu", "demos": file}
-    none = {"demonstrations": None, "preferred_share": None}
+    none = {"demonstrations": None, "preferred_share": None, "begin_with": None}
     assert preset.rounds == 3
     asked = argparse.Namespace(**wishes, **none, rounds=None)
     assert pretrain._for_a_set(asked, preset).rounds == 0

@@ -4,13 +4,13 @@ file."""
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
+from worker.cli.takeovers import round_folder, take_over
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from rodif_core.training_state import UpdateProgress
     from rodif_core.trajectory import Trajectory
 
-# Seeds of their own: takeovers start elsewhere than demonstrations and measurements.
-RECOVERY_SEEDS = 500_000_000  # first seed of a run's takeovers, and …
-ROUND_SEEDS = 1_000_000  # … how far the seeds of its rounds are apart
 PRESET_NAMES = ("cpu", "paper")  # of rodif_core.presets, which the help does not load
 # Fields of a preset that an argument changes.
-OF_PRESETS = ("updates", "executed_steps", "rounds", "recoveries", "drives", "round_updates")
+OF_PRESETS = (
+    *("updates", "executed_steps", "rounds", "recoveries", "drives", "steered_drives"),
+    "round_updates",
+)
 PRECISIONS = ("float32", "bfloat16")  # of rodif_core.training_state
 DEMONSTRATIONS = 2000  # scripted ones, unless said
 
@@ -57,7 +57,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="rollouts for each takeover; from 2 on, as many takeovers from the failures as from"
         " the successes of each group (default: the preset's)",
     )
+    parser.add_argument(
+        "--steered-drives",
+        type=int,
+        help="further rollouts for each takeover, by copies of the policy that each go one group's"
+        " way (default: the preset's)",
+    )
     parser.add_argument("--round-updates", type=int, help="of a round (default: the preset's)")
+    parser.add_argument(
+        "--begin-with",
+        type=Path,
+        metavar="FILE",
+        help="no first training: go on from this checkpoint, with --rounds (and, where the preset"
+        " gives eyes to a policy of another task, its looks)",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--processes", type=int, default=1, help="cores for rollouts (default %(default)s)"
@@ -149,12 +162,13 @@ def _for_a_set(args: argparse.Namespace, config: PretrainConfig) -> PretrainConf
                 f"--{name.replace('_', '-')} is for scripted demonstrations, and --demos takes all"
                 f" of {args.demos}; give one or the other"
             )
-    if config.begin_with is not None:
+    if config.begin_with is not None and args.begin_with is None:
         raise RodifError(
             f"preset {args.preset!r} of task {args.task!r} begins with the shipped policy of"
             f" {config.begin_with.value!r}, which learned from scripted demonstrations, so --demos"
             f" cannot decide what it does; legal are --preset paper, which begins with fresh"
-            f" weights, or task {config.begin_with.value!r} with a set of its own"
+            f" weights, --begin-with a policy of your own, or task {config.begin_with.value!r}"
+            f" with a set of its own"
         )
     return config if args.rounds is not None else replace(config, rounds=0)
 
@@ -184,32 +198,56 @@ def _first_shown(
     return shown, {}
 
 
+def _begin(args: argparse.Namespace, config: PretrainConfig) -> Checkpoint | None:
+    """The policy to go on from: of a file, the shipped one that the preset names, or none.
+
+    Raises RodifError for a file of a task that this one cannot begin with, and where nothing would
+    follow.
+    """
+    from rodif_core.fit import check_fit
+    from rodif_core.policies.checkpoint import load_checkpoint
+    from rodif_core.shipped import shipped_checkpoint
+
+    if args.begin_with is None:
+        named = config.begin_with
+        return None if named is None else load_checkpoint(shipped_checkpoint(named))
+    start = load_checkpoint(args.begin_with.read_bytes())
+    check_fit(start)
+    legal = [TaskName(args.task), *([config.begin_with] if config.begin_with else [])]
+    if start.task not in legal:
+        names = " or ".join(repr(name.value) for name in legal)
+        raise RodifError(
+            f"--begin-with {args.begin_with} is a policy of task {start.task.value!r}, but must be"
+            f" of {names}"
+        )
+    if config.looks + config.rounds < 1:
+        raise RodifError(f"--begin-with {args.begin_with} with 0 rounds trains nothing; legal: 1 …")
+    return start
+
+
 def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> Checkpoint:
     """The first training and the rounds after it, each on all that experts have shown so far."""
-    from rodif_core.policies.checkpoint import load_checkpoint
     from rodif_core.pretrain import pretrain
-    from rodif_core.shipped import shipped_checkpoint
     from rodif_core.tasks import get_task
     from rodif_core.training_state import Precision, check_device
 
     check_device(args.device)
+    checkpoint = _begin(args, config)
     shown, told = _first_shown(args, get_task(args.task), bar)
     shown_first = len(shown)
-    checkpoint = None
-    if config.begin_with is not None:
-        checkpoint = load_checkpoint(shipped_checkpoint(config.begin_with))
     driven: list[Trajectory] = []
     on_the_way: list[float] = []  # success of the policies that experts took over from
     first = 1 if checkpoint is None else 0  # a first training, which no rollouts precede
     for number in range(first + config.looks + config.rounds):
         if checkpoint is not None:
-            met, recoveries = _take_over(args, config, checkpoint, number)
+            met, recoveries = take_over(args, config, checkpoint, number)
             shown += recoveries
             # Only encoders learn from it, and thousands of rollouts take gigabytes.
             driven += met if config.images is not None else []
             succeeded = sum(one.success for one in met) / len(met)
             bar.console.print(f"before round {number}: success {succeeded:.1%}")
-            on_the_way += [succeeded] if number else []  # the policy begun with is another task's
+            # The policy begun with may be another task's, which is told the state.
+            on_the_way += [succeeded] if checkpoint.task == args.task else []
         updates = config.updates if checkpoint is None else config.round_updates
         training = bar.add_task(f"training {number}", total=updates)
         checkpoint = pretrain(
@@ -219,7 +257,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
             start=checkpoint,
             driven=driven,
             only_encoder=number < config.looks,
-            workspace=_round_folder(args, number),
+            workspace=round_folder(args.workspace, number),
             kept_rows=args.workspace and args.workspace / "rows",
             device=args.device,
             precision=Precision(args.precision) if args.precision else None,
@@ -235,49 +273,6 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         **told,
     }
     return replace(checkpoint, card=checkpoint.card | facts)
-
-
-def _round_folder(args: argparse.Namespace, number: int) -> Path | None:
-    """Where a round keeps what it has done so far, if it is to."""
-    if args.workspace is None:
-        return None
-    folder: Path = args.workspace / f"round-{number}"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def _take_over(
-    args: argparse.Namespace, config: PretrainConfig, checkpoint: Checkpoint, number: int
-) -> tuple[list[Trajectory], list[Trajectory]]:
-    """What the policy did in its rollouts, and how experts went on from there.
-
-    Both stay in the workspace: with pictures they take longer than a training.
-    """
-    from rodif_core.demonstrations import load_demonstrations, save_demonstrations
-    from rodif_core.recoveries import make_recoveries
-    from rodif_core.tasks import get_task
-    from worker.parallel import parallel_rollout
-
-    folder, files = _round_folder(args, number), []
-    if folder is not None:
-        sizes = f"{config.recoveries}x{config.drives}.npz"
-        files = [folder / f"driven-{sizes}", folder / f"recoveries-{sizes}"]
-    if files and all(file.exists() for file in files):
-        driven, recoveries = (load_demonstrations(file) for file in files)
-        if driven[0].info["checkpoint"] == checkpoint.digest:
-            return driven, recoveries
-    first_seed = RECOVERY_SEEDS + number * ROUND_SEEDS + args.seed
-    drives = config.recoveries * config.drives
-    settings = RolloutConfig(episodes=drives, seed=first_seed)
-    driven = parallel_rollout(checkpoint, settings, args.processes)
-    count = config.recoveries if config.drives > 1 else None
-    recoveries = make_recoveries(get_task(args.task), driven, args.preferred_share, count)
-    if recoveries:
-        for file, episodes in zip(files, (driven, recoveries), strict=False):
-            partial = file.with_suffix(".partial")  # a kill leaves no file that is cut short
-            save_demonstrations(partial, episodes)
-            os.replace(partial, file)
-    return driven, recoveries
 
 
 def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
