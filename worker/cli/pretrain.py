@@ -42,6 +42,34 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--executed-steps", type=int, help="control steps between two decisions (default: preset's)"
     )
+    _add_round_arguments(parser)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--processes", type=int, default=1, help="cores for rollouts (default %(default)s)"
+    )
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default %(default)s)")
+    parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        help="of the forward passes; bfloat16 is mixed precision (default: that on a GPU)",
+    )
+    parser.add_argument(
+        "--workspace", type=Path, help="keeps partial state; a broken run goes on from there"
+    )
+    parser.add_argument(
+        "--track",
+        type=int,
+        default=50,
+        help="rollouts after each of the first four fifths of a training, which tell how far it"
+        " is; 0 for none (default %(default)s)",
+    )
+    parser.add_argument(
+        "--evaluate", type=int, default=500, help="rollouts of the final measurement, 0 for none"
+    )
+
+
+def _add_round_arguments(parser: argparse.ArgumentParser) -> None:
+    """What follows the first training, or takes its place."""
     parser.add_argument(
         "--rounds",
         type=int,
@@ -70,29 +98,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="FILE",
         help="no first training: go on from this checkpoint, with --rounds (and, where the preset"
         " gives eyes to a policy of another task, its looks)",
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--processes", type=int, default=1, help="cores for rollouts (default %(default)s)"
-    )
-    parser.add_argument("--device", default="cpu", help="cpu or cuda (default %(default)s)")
-    parser.add_argument(
-        "--precision",
-        choices=PRECISIONS,
-        help="of the forward passes; bfloat16 is mixed precision (default: that on a GPU)",
-    )
-    parser.add_argument(
-        "--workspace", type=Path, help="keeps partial state; a broken run goes on from there"
-    )
-    parser.add_argument(
-        "--track",
-        type=int,
-        default=50,
-        help="rollouts after each of the first four fifths of a training, which tell how far it"
-        " is; 0 for none (default %(default)s)",
-    )
-    parser.add_argument(
-        "--evaluate", type=int, default=500, help="rollouts of the final measurement, 0 for none"
     )
 
 
