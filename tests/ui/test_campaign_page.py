@@ -384,6 +384,7 @@ def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
     page.locator(f'[data-checkpoint="{second.id}"]').get_by_text("published").wait_for()
     page.get_by_role("button", name="Roll back").click()
     dialog = page.get_by_role("dialog", name="Roll back to avoid-pretrained?")
+    dialog.wait_for()
     with studio.database.write() as session:  # somebody else is quicker
         publications.publish(
             session, now, campaign_id=campaign, checkpoint_id=start, reason="", by=None

@@ -189,7 +189,7 @@ def _first_shown(
         shown, told = read_set(task, args.demos)
         sources = ", ".join(f"{source} {count}" for source, count in told["sources"].items())
         said = f"{args.demos}: {len(shown)} demonstrations ({sources})"
-        bar.console.print(said, markup=False, highlight=False)
+        bar.console.print(said, markup=False, highlight=False, soft_wrap=True)
         return shown, {"demonstration_set": told}
     episodes = DEMONSTRATIONS if args.demonstrations is None else args.demonstrations
     making = bar.add_task("demonstrations", total=episodes)

@@ -108,8 +108,15 @@ export function campaignActions(id, data, refresh) {
     });
   };
 
-  const rollBack = () => {
-    const checkpoint_id = data.stats.rollback_checkpoint_id; // as the dialog names it
+  const rollBack = async () => {
+    // Asked for now: what the page knows may be older than the last move of somebody else.
+    let checkpoint_id;
+    try {
+      ({ rollback_checkpoint_id: checkpoint_id } = await get(`/campaigns/${id}/stats`));
+    } catch (error) {
+      return toast(describe(error), { bad: true });
+    }
+    if (checkpoint_id === null) return toast("There is nothing to roll back to.", { bad: true });
     const name = nameOf(checkpoint_id);
     return confirmed(`Rolled back to ${name}.`, {
       title: `Roll back to ${name}?`,
