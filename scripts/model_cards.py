@@ -26,7 +26,7 @@ PAPER_SUCCESS = {"avoid": 78, "pushing": 58, "sorting": 82, "aligning": 5, "stac
 CPU_MINUTES = {
     "avoid": 10,
     "pushing": 33,
-    "sorting": 200,
+    "sorting": 140,
     "aligning": 90,
     "aligning-state": 9,
     "stacking": 195,
@@ -88,46 +88,16 @@ def _card(checkpoint: Checkpoint) -> str:
         f" executed {config.executed_steps}, K = {config.denoising_steps}"
     )
     shown = card["demonstrations"] - card.get("recoveries", 0)
-    data = _data(card, shown) + _steered(card)
+    data = _data(card, shown)
     if checkpoint.policy.encoder is not None:
         data += _seen(checkpoint)
     return (
         f"\n## {name}\n"
         f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}"
         f" Up to {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
-        f"```\n{_commands(checkpoint, shown)}\n```\n"
+        f"```\nrodif pretrain {name} --preset cpu --demonstrations {shown}"
+        f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
-    )
-
-
-def _commands(checkpoint: Checkpoint, shown: int) -> str:
-    """What makes such a policy: one command, or two where a steered round was added later."""
-    name, last = checkpoint.task.value, checkpoint.card.get("steered_round")
-    first, out = (
-        f"rodif pretrain {name} --preset cpu --demonstrations {shown}",
-        f"{name}.safetensors",
-    )
-    measured = f"--evaluate {measurement(checkpoint)['n']} --out {out}"
-    if last is None:
-        return f"{first} {measured}"
-    return (
-        f"{first} --out before.safetensors\n"
-        f"rodif pretrain {name} --begin-with before.safetensors --rounds 1 --demonstrations {shown}"
-        f" --recoveries {last['tried']} --drives 1 --steered-drives 1 {measured}"
-    )
-
-
-def _steered(card: dict[str, Any]) -> str:
-    """What a round showed that came after the preset's."""
-    last = card.get("steered_round")
-    if last is None:
-        return ""
-    return (
-        f" One more round began with that policy (digest `{card['start'][:16]}`): on the"
-        f" demonstrations and what experts did after takeovers from {last['rollouts']:,} rollouts"
-        f" of a copy that goes {last['group']} ({card['recoveries']}), which was made a little"
-        " otherwise than the second command makes it"
-        " ([tasks.md](tasks.md#what-made-them-learnable))."
     )
 
 
@@ -147,16 +117,9 @@ def _data(card: dict[str, Any], shown: int) -> str:
     if rounds:
         data += (
             f"; then {rounds} rounds of {preset['round_updates']:,} updates, each on what"
-            f" experts did after takeovers too ({_in_rounds(card)} in all)"
+            f" experts did after takeovers too ({card['recoveries']} in all)"
         )
     return data + "."
-
-
-def _in_rounds(card: dict[str, Any]) -> int:
-    """Takeovers of the preset's rounds."""
-    later = card.get("steered_round")
-    count: int = card["recoveries"] if later is None else later["earlier_recoveries"]
-    return count
 
 
 def _seen(checkpoint: Checkpoint) -> str:
