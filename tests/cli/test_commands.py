@@ -193,6 +193,14 @@ def test_pretrain_tells_what_it_cannot_begin_with(
     assert message in capsys.readouterr().err
 
 
+def test_pretrain_names_a_file_that_it_cannot_begin_with_because_it_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    arguments = ["--begin-with", str(tmp_path / "none"), "--rounds", "1"]
+    assert main(["pretrain", "avoid", *arguments, "--out", str(tmp_path / "x")]) == 1
+    assert "none' is neither a readable file" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--rounds", "--track", "--evaluate", "--steered-drives"])
 def test_pretrain_refuses_negative_numbers(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

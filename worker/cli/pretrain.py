@@ -206,17 +206,18 @@ def _first_shown(
 def _begin(args: argparse.Namespace, config: PretrainConfig) -> Checkpoint | None:
     """The policy to go on from: of a file, the shipped one that the preset names, or none.
 
-    Raises RodifError for a file of a task that this one cannot begin with, and where nothing would
-    follow.
+    Raises RodifError for a file that cannot be read or is of a task that this one cannot begin
+    with, and where nothing would follow.
     """
     from rodif_core.fit import check_fit
     from rodif_core.policies.checkpoint import load_checkpoint
     from rodif_core.shipped import shipped_checkpoint
+    from worker.cli.evaluate import read_checkpoint
 
     if args.begin_with is None:
         named = config.begin_with
         return None if named is None else load_checkpoint(shipped_checkpoint(named))
-    start = load_checkpoint(args.begin_with.read_bytes())
+    start = load_checkpoint(read_checkpoint(str(args.begin_with)))
     check_fit(start)
     legal = [TaskName(args.task), *([config.begin_with] if config.begin_with else [])]
     if start.task not in legal:
