@@ -89,15 +89,44 @@ def _card(checkpoint: Checkpoint) -> str:
     )
     shown = card["demonstrations"] - card.get("recoveries", 0)
     data = _data(card, shown)
+    if "began_with" in card:
+        data = _data(card["began_with"], shown) + _went_on(card)
     if checkpoint.policy.encoder is not None:
         data += _seen(checkpoint)
     return (
         f"\n## {name}\n"
         f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}"
         f" Up to {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
-        f"```\nrodif pretrain {name} --preset cpu --demonstrations {shown}"
-        f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
+        f"```\n{_commands(checkpoint, shown)}\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
+    )
+
+
+def _commands(checkpoint: Checkpoint, shown: int) -> str:
+    """What makes such a policy: one command, or two where further rounds came later."""
+    name, card = checkpoint.task.value, checkpoint.card
+    command = f"rodif pretrain {name}"
+    first = f"{command} --preset cpu --demonstrations {shown}"
+    last = f"--evaluate {measurement(checkpoint)['n']} --out {name}.safetensors"
+    if "began_with" not in card:
+        return f"{first} {last}"
+    names = ("rounds", "recoveries", "drives", "steered_drives")
+    options = " ".join(f"--{one.replace('_', '-')} {card['preset'][one]}" for one in names)
+    return (
+        f"{first} --out before.safetensors\n"
+        f"{command} --begin-with before.safetensors --demonstrations {shown} {options} {last}"
+    )
+
+
+def _went_on(card: dict[str, Any]) -> str:
+    """What came after the policy of a file that the training went on from."""
+    preset = card["preset"]
+    rollouts = preset["recoveries"] * preset["steered_drives"]
+    return (
+        f" With that policy (digest `{card['began_with']['digest'][:16]}`) began {preset['rounds']}"
+        f" more of {preset['round_updates']:,} updates, on the demonstrations and what experts did"
+        f" after takeovers ({card['recoveries']}) from it and from {rollouts:,} rollouts of copies"
+        " that each go one group's way ([tasks.md](tasks.md#what-made-them-learnable))."
     )
 
 

@@ -27,7 +27,9 @@ def test_page_of_models_is_made_from_the_shipped_files():
 
 @pytest.mark.parametrize("task", shipped_tasks())
 def test_a_shipped_policy_was_trained_with_todays_preset(task: TaskName):
-    trained = dict(load_checkpoint(shipped_checkpoint(task)).card["preset"])
+    card = load_checkpoint(shipped_checkpoint(task)).card
+    # What went on from a file began with the preset's policy.
+    trained = dict(card.get("began_with", card)["preset"])
     today = json.loads(json.dumps(asdict(preset_for(task, "cpu"))))
     if "channels" in trained:  # Avoid's card, of a time when there was one architecture only
         trained["size"] = today["size"] | {"channels": trained.pop("channels")}
@@ -71,3 +73,17 @@ def test_card_of_a_policy_that_got_eyes_tells_what_it_began_with():
     assert "400 scripted demonstrations and what experts did after takeovers (90 in all)" in card
     assert "3 trainings of the encoder alone, then 1 rounds of 8,000 updates" in card
     assert "saw 2,500 moments in 4,000 updates of 64, then 3 times as many in 70." in card
+
+
+def test_card_of_a_policy_that_went_on_from_a_file_tells_both_commands():
+    shipped = load_checkpoint(shipped_checkpoint(TaskName.PUSHING))
+    origin = {"preset": shipped.card["preset"], "rounds": 0, "digest": "ab" * 32}
+    further = {"rounds": 1, "recoveries": 30, "drives": 1, "steered_drives": 2}
+    preset = shipped.card["preset"] | further | {"round_updates": 700}
+    told = {"began_with": origin, "preset": preset, "recoveries": 20, "demonstrations": 2_020}
+    card = model_cards._card(replace(shipped, card=shipped.card | told))
+    assert "With that policy (digest `abababababababab`) began 1 more of 700 updates" in card
+    assert "takeovers (20) from it and from 60 rollouts of copies" in card
+    assert "--demonstrations 2000 --out before.safetensors\n" in card
+    options = "--rounds 1 --recoveries 30 --drives 1 --steered-drives 2 --evaluate 500"
+    assert f"--begin-with before.safetensors --demonstrations 2000 {options}" in card

@@ -170,6 +170,9 @@ def test_pretrain_goes_on_from_a_file_with_takeovers_from_steered_copies(
     assert made.card["start"] == begun.digest
     assert made.card["preset"]["steered_drives"] == 2
     assert len(made.card["success_before_rounds"]) == 1
+    origin = {"task": "avoid", "digest": begun.digest}
+    kept = {"preset": begun.card["preset"], "demonstrations": begun.card["demonstrations"]}
+    assert made.card["began_with"] == origin | kept
     taken = load_demonstrations(work / "round-0" / "recoveries-4x1+2.npz")
     assert 1 <= made.card["recoveries"] == len(taken) <= 4
     assert {one.info["checkpoint"] for one in taken} - {begun.digest}  # a copy drove, too

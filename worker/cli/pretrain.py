@@ -238,7 +238,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     from rodif_core.training_state import Precision, check_device
 
     check_device(args.device)
-    checkpoint = _begin(args, config)
+    checkpoint = start = _begin(args, config)
     shown, told = _first_shown(args, get_task(args.task), bar)
     shown_first = len(shown)
     driven: list[Trajectory] = []
@@ -278,7 +278,16 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
         "success_before_rounds": on_the_way,
         **told,
     }
+    if start is not None and args.begin_with is not None:
+        facts["began_with"] = _origin(start)
     return replace(checkpoint, card=checkpoint.card | facts)
+
+
+def _origin(start: Checkpoint) -> dict[str, Any]:
+    """How a policy was made that a training goes on from: no shipped file may tell of it."""
+    names = ("preset", "demonstrations", "rounds", "recoveries", "demonstration_set", "began_with")
+    kept = {name: start.card[name] for name in names if name in start.card}
+    return {"task": start.task.value, "digest": start.digest, **kept}
 
 
 def _showing(bar: Progress, row: TaskID, tracked: int) -> UpdateProgress:
