@@ -92,6 +92,9 @@ export function noiseText(round) {
   );
 }
 
+// Beside the publishing rule "manual", "manual" would say the wrong thing.
+const TRIGGERS = { manual: "started by hand", labels: "enough new labels", periodic: "by the clock" };
+
 const arrow = (before, after, key) =>
   after ? `${percent(before?.[key])} → ${percent(after[key])}` : "–";
 
@@ -104,7 +107,7 @@ export function roundTable(rounds, selected, { onSelect, onPublish, publishedId 
       `tr${round.id === selected ? ".selected" : ""}`, { dataset: { key: round.id, round: round.id } },
       cell(element("button.link", { type: "button", onclick: () => onSelect(round.id) }, `Round ${round.id}`)),
       cell([pill(round.state), round.error ? under(element("span.error-text", {}, round.error)) : null]),
-      cell([round.config.method, under(round.publish_rule === "never" ? "comparison" : words(round.trigger))]),
+      cell([round.config.method, under(round.publish_rule === "never" ? "comparison" : TRIGGERS[round.trigger] ?? words(round.trigger))]),
       cell(count(round.labels), ".number"),
       cell(round.noise ? round.noise.conservativeness.toFixed(2) : "–", ".number"),
       cell(arrow(before, after, "success"), ".number"),
@@ -156,7 +159,7 @@ export function jobTable(jobs, { onRetry, onCancel }) {
     "tr", { dataset: { key: job.id, job: job.id } },
     cell(`${words(job.kind)} ${job.id}`),
     cell([pill(job.state), job.error ? under(element("span.error-text", {}, job.error)) : null]),
-    cell([job.stage, job.state === "running" ? under(percent(job.progress)) : null]),
+    cell([words(job.stage), job.state === "running" ? under(percent(job.progress)) : null]),
     cell(job.attempt, ".number"),
     cell(ago(job.finished_at ?? job.started_at ?? job.created_at), ".tight"),
     cell(jobButton(job, onRetry, onCancel), ".tight"),

@@ -32,6 +32,15 @@ function row(person) {
   );
 }
 
+// After a dialog: what has changed is stored already, so not being able to show it loses nothing.
+async function redraw() {
+  try {
+    await drawPeople();
+  } catch (error) {
+    toast(describe(error), { bad: true, seconds: 12 });
+  }
+}
+
 const patch = (person, body) => request("PATCH", `/annotators/${person.id}`, { body });
 
 export async function addPerson() {
@@ -46,7 +55,7 @@ export async function addPerson() {
     onSubmit: (values) => post("/annotators", values),
   });
   if (made) toast(`${made.name} can sign in now.`);
-  await drawPeople();
+  await redraw();
 }
 
 async function setPassword(person) {
@@ -58,7 +67,7 @@ async function setPassword(person) {
     onSubmit: ({ password }) => patch(person, { password }),
   });
   if (done) toast("The password is changed.");
-  await drawPeople();
+  await redraw();
 }
 
 async function deactivate(person) {
@@ -69,14 +78,14 @@ async function deactivate(person) {
     danger: true,
     onSubmit: () => patch(person, { active: false }),
   });
-  await drawPeople();
+  await redraw();
 }
 
 async function activate(person) {
   try {
     await patch(person, { active: true });
     toast(`${person.name} can sign in again.`);
-    await drawPeople();
+    await redraw();
   } catch (error) {
     toast(describe(error), { bad: true, seconds: 12 });
   }

@@ -1,7 +1,7 @@
 // Tokens for scripts: made for an account, shown once, listed without the secret, revoked.
 
 import { getAll, post, request } from "./api.js";
-import { ask, element, find, replace, show, toast } from "./dom.js";
+import { ask, describe, element, find, replace, show, toast } from "./dom.js";
 import { ago, day } from "./format.js";
 import { table } from "./panels.js";
 
@@ -13,6 +13,14 @@ export async function drawTokens(people) {
   const heads = [["Token"], ["Account"], ["Last used"], ["Valid until"], [""]];
   const rows = tokens.map((token) => row(token, nameOf.get(token.annotator_id), people));
   replace(find("#tokens"), table(heads, rows, "None. Scripts and the rodif commands sign in with a token."));
+}
+
+async function redraw(people) {
+  try {
+    await drawTokens(people);
+  } catch (error) {
+    toast(describe(error), { bad: true, seconds: 12 });
+  }
 }
 
 function row(token, owner, people) {
@@ -49,7 +57,7 @@ export async function addToken(people) {
     element("p.muted", {}, "Copy it now: it is not shown again."),
     element("p", {}, element("code.secret", {}, made.token)),
   );
-  await drawTokens(people);
+  await redraw(people);
 }
 
 async function revoke(token, owner, people) {
@@ -61,5 +69,5 @@ async function revoke(token, owner, people) {
     onSubmit: () => request("DELETE", `/tokens/${token.id}`),
   });
   if (done) toast("The token is revoked.");
-  await drawTokens(people);
+  await redraw(people);
 }
