@@ -468,6 +468,10 @@ def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Pag
     confirm(page, "Save")
     page.get_by_role("heading", name=name).wait_for()
     page.locator("#archived").get_by_text("archived").wait_for()
+    assert page.locator(".crumb").last.inner_text() == name
+    assert page.title() == f"{name} · RoDiF Studio"
+    for refused in ("Collect runs", "Start round"):
+        assert page.get_by_role("button", name=refused).is_disabled()
     page.goto(f"{studio.url}/admin")
     page.locator("#people tr").first.wait_for()
     assert page.get_by_role("heading", name=name).count() == 0
@@ -477,6 +481,7 @@ def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Pag
     page.get_by_label("Campaign", exact=True).select_option("in use")
     confirm(page, "Save")
     page.locator("#archived").wait_for(state="hidden")
+    assert page.get_by_role("button", name="Collect runs").is_enabled()
     with studio.database.read() as session:
         row = session.get_one(Campaign, campaign)
     assert (row.name, row.archived) == (name, False)

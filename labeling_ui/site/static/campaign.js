@@ -108,11 +108,16 @@ function shownRound() {
 function draw() {
   if (!data.stats || !data.published) return;
   const { campaign, stats, published } = data;
-  find("h1").textContent = campaign.name;
+  for (const place of ["h1", ".crumb:last-child"]) find(place).textContent = campaign.name;
+  document.title = `${campaign.name} · RoDiF Studio`;
   find("#archived").hidden = !campaign.archived;
   find("#published").textContent = `Published policy: ${published.name}`;
   find(".criterion-text").textContent = `“${campaign.criterion}”`;
   enable("#collect", "#settings", "#start-round"); // their dialogs show what has been loaded
+  for (const name of ["#collect", "#start-round"]) { // the server would refuse both
+    find(name).disabled = campaign.archived;
+    find(name).title = campaign.archived ? "The campaign is archived: see Settings" : "";
+  }
   find("#rollback").disabled = stats.rollback_checkpoint_id === null;
   renew(find("#tiles"), panels.tiles(stats, evaluationOf(published)));
   renew(find("#annotators"), panels.annotatorTable(stats.annotators));

@@ -26,7 +26,7 @@ function layout(title, updates, axis) {
     font, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     margin: { l: 48, r: 12, t: 36, b: 72 },
     xaxis: { title: { text: "update", font, standoff: 8 }, dtick: updates <= 10 ? 1 : null, gridcolor: line, zerolinecolor: line, rangemode: "tozero" },
-    yaxis: { gridcolor: line, zerolinecolor: line, ...axis },
+    yaxis: { gridcolor: line, zerolinecolor: line, rangemode: updates > 1 ? "normal" : "tozero", ...axis },
     showlegend: true,
     legend: { orientation: "h", x: 0, y: -0.26, yanchor: "top" },
     hovermode: "x unified",

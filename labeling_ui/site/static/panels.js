@@ -113,7 +113,7 @@ export function roundTable(rounds, selected, { onSelect, onPublish, publishedId 
       cell(arrow(before, after, "success"), ".number"),
       cell(arrow(before, after, "alignment"), ".number"),
       cell(ago(round.created_at), ".tight"),
-      cell(mayPublish ? element("button.button.small", { type: "button", onclick: () => onPublish(round.candidate_checkpoint_id) }, "Publish") : null, ".tight"),
+      cell(mayPublish ? element("button.button.small", { type: "button", "aria-label": `Publish the policy of round ${round.id}`, onclick: () => onPublish(round.candidate_checkpoint_id) }, "Publish") : null, ".tight"),
     );
   });
   const heads = [
@@ -136,10 +136,10 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
       cell(rate("success"), ".number"), cell(rate("alignment"), ".number"), cell(rate("off_support"), ".number"),
       cell(ago(checkpoint.created_at), ".tight"),
       cell([
-        element("button.button.small", { type: "button", onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
+        element("button.button.small", { type: "button", "aria-label": `Lineage of ${checkpoint.name}`, onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
         element("a.button.small", { href: `/api/v1/checkpoints/${checkpoint.id}/file`, download: "", "aria-label": `Download ${checkpoint.name}` }, "Download"), " ",
         published || checkpoint.comparison ? null
-          : element("button.button.small", { type: "button", onclick: () => onPublish(checkpoint.id) }, "Publish"),
+          : element("button.button.small", { type: "button", "aria-label": `Publish ${checkpoint.name}`, onclick: () => onPublish(checkpoint.id) }, "Publish"),
       ], ".tight"),
     );
   });
@@ -149,7 +149,8 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
 
 // What can be done about a job by hand, if anything.
 function jobButton(job, onRetry, onCancel) {
-  const button = (name, onclick) => element("button.button.small", { type: "button", onclick }, name);
+  const what = `${words(job.kind)} ${job.id}`;
+  const button = (name, onclick) => element("button.button.small", { type: "button", "aria-label": `${name} ${what}`, onclick }, name);
   if (job.state === "failed") return button("Retry", () => onRetry(job));
   return canBeCancelled(job) ? button("Cancel", () => onCancel(job)) : null;
 }

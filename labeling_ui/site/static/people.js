@@ -19,10 +19,12 @@ export async function drawPeople() {
 }
 
 function row(person) {
-  const change = (text, action) => element("button.button.small", { type: "button", onclick: action }, text);
+  const name = `person-${person.id}`; // says whose buttons these are, to who does not see the row
+  const change = (text, action) =>
+    element("button.button.small", { type: "button", "aria-describedby": name, onclick: action }, text);
   return element(
     "tr", { dataset: { person: person.id } },
-    element("td", {}, person.name, person.active ? null : element("span.under", {}, "deactivated")),
+    element("td", { id: name }, person.name, person.active ? null : element("span.under", {}, "deactivated")),
     element("td", {}, person.role, person.kind === "simulated" ? element("span.under", {}, "simulated") : null),
     element("td.number", {}, count(person.labels)),
     element(

@@ -24,13 +24,14 @@ async function redraw(people) {
 }
 
 function row(token, owner, people) {
+  const name = `token-${token.id}`;
   return element(
     "tr", { dataset: { token: token.id } },
-    element("td", {}, token.name),
+    element("td", { id: name }, token.name),
     element("td", {}, owner),
     element("td", {}, token.last_used_at ? ago(token.last_used_at) : "never"),
     element("td", {}, day(token.expires_at)),
-    element("td.tight", {}, element("button.button.small", { type: "button", onclick: () => revoke(token, owner, people) }, "Revoke")),
+    element("td.tight", {}, element("button.button.small", { type: "button", "aria-describedby": name, onclick: () => revoke(token, owner, people) }, "Revoke")),
   );
 }
 
