@@ -125,3 +125,21 @@ def test_new_campaign_starts_from_the_policy_that_was_chosen(studio: Studio, pag
     with studio.database.read() as session:
         made = session.scalars(select(Campaign).where(Campaign.name == campaign)).one()
     assert made.start_checkpoint_id == made.published_checkpoint_id == older.id
+
+
+def test_campaigns_and_people_stay_on_the_page_when_the_server_does_not_answer(
+    studio: Studio, page: Page
+) -> None:
+    campaign, errors = studio.add_campaign(), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    sign_in(page, studio, "admin", "/admin")
+    page.locator("#tokens").locator("table, .empty").first.wait_for()
+    page.route("**/api/v1/**", lambda route: route.abort())
+    card = page.locator(f'a[href="/admin/campaigns/{campaign}"]')
+    for name in ("New campaign", "New account"):
+        page.get_by_role("button", name=name).click()
+        page.keyboard.press("Escape")  # the new account's dialog opens, the new campaign's does not
+        page.locator("#toast").get_by_text("The server cannot be reached.").wait_for()
+        page.evaluate("document.querySelector('#toast').remove()")
+        assert card.is_visible()
+    assert errors == []

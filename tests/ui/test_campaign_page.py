@@ -13,6 +13,7 @@ from server import campaigns, publications, rounds
 from server.labeling import ScreenChoice
 from server.states import JobKind, JobState, PairState, PublishRule, Role, RoundState
 from server.store import jobs
+from server.store.events import add_event
 from server.store.tables import Campaign, Checkpoint, Job, Pair, Publication, Round
 from tests.ui.driving import sign_in, until
 from tests.ui.rounds import WorkerStandIn, evaluation, label_all
@@ -357,6 +358,7 @@ def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
     with studio.database.write() as session:
         start = session.get_one(Campaign, campaign).start_checkpoint_id
         row = session.get_one(Checkpoint, comparison)
+        start_name = session.get_one(Checkpoint, start).name  # other tests add newer ones
         second = Checkpoint(
             task=row.task,
             name=studio.new_name("second"),
@@ -383,7 +385,7 @@ def test_what_cannot_be_published_is_not_offered_and_what_can_be_rolled_back_is(
     confirm(page, "Roll back")
     page.locator(f'[data-checkpoint="{second.id}"]').get_by_text("published").wait_for()
     page.get_by_role("button", name="Roll back").click()
-    dialog = page.get_by_role("dialog", name="Roll back to avoid-pretrained?")
+    dialog = page.get_by_role("dialog", name=f"Roll back to {start_name}?")
     dialog.wait_for()
     with studio.database.write() as session:  # somebody else is quicker
         publications.publish(
@@ -425,6 +427,23 @@ def test_page_says_of_a_kept_candidate_whether_it_can_be_published(
     assert offered.count() == (0 if rule is PublishRule.NEVER else 1)
 
 
+def test_figures_of_a_policy_come_from_its_measurement_of_most_runs(
+    studio: Studio, page: Page
+) -> None:
+    campaign = studio.add_campaign([True])
+    label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
+    for before in (evaluation(22, 70, 8), evaluation(3, 4, 3)):  # the newest one is the smallest
+        with studio.database.write() as session:
+            request = rounds.RoundRequest(publish_rule=PublishRule.MANUAL)
+            this = rounds.launch(session, datetime.now(UTC), campaign, request).id
+        worker = WorkerStandIn(studio, this)
+        worker.start()
+        worker.finish(before, evaluation(9, 1, 0))
+    open_campaign(page, studio, campaign)
+    assert tile(page, "Success, published") == "92 %"
+    assert "n = 100" in page.locator(".tile", has_text="Success, published").inner_text()
+
+
 def test_page_says_why_a_round_learned_nothing(studio: Studio, page: Page) -> None:
     campaign = studio.add_campaign([True])
     label_all(studio, campaign, studio.add_annotator(), ScreenChoice.LEFT)
@@ -449,6 +468,10 @@ def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Pag
     confirm(page, "Save")
     page.get_by_role("heading", name=name).wait_for()
     page.locator("#archived").get_by_text("archived").wait_for()
+    assert page.locator(".crumb").last.inner_text() == name
+    assert page.title() == f"{name} · RoDiF Studio"
+    for refused in ("Collect runs", "Start round"):
+        assert page.get_by_role("button", name=refused).is_disabled()
     page.goto(f"{studio.url}/admin")
     page.locator("#people tr").first.wait_for()
     assert page.get_by_role("heading", name=name).count() == 0
@@ -458,6 +481,7 @@ def test_a_campaign_is_renamed_archived_and_taken_back(studio: Studio, page: Pag
     page.get_by_label("Campaign", exact=True).select_option("in use")
     confirm(page, "Save")
     page.locator("#archived").wait_for(state="hidden")
+    assert page.get_by_role("button", name="Collect runs").is_enabled()
     with studio.database.read() as session:
         row = session.get_one(Campaign, campaign)
     assert (row.name, row.archived) == (name, False)
@@ -503,3 +527,50 @@ def test_a_collection_is_cancelled_on_its_card_and_a_replay_in_its_row(
         states = {number: session.get_one(Job, number).state for number in (collect, replay)}
         assert states == {collect: JobState.CANCELLED, replay: JobState.CANCELLED}
         assert session.get_one(Pair, pair.id).state == PairState.FAILED
+
+
+def test_running_work_is_seen_however_much_has_failed_and_its_row_moves_with_its_card(
+    studio: Studio, page: Page
+) -> None:
+    campaign, now = studio.add_campaign([True]), datetime.now(UTC)
+    with studio.database.write() as session:
+        collect = campaigns.start_collect(session, now, campaign, {}, by=1)
+        collect.state, collect.stage, collect.progress = JobState.RUNNING, "rollouts", 0.25
+        collect.attempt, collect.started_at = 1, now
+        for _ in range(25):
+            failed = {"state": JobState.FAILED, "error": "no picture", "payload": {}}
+            row = Job(kind=JobKind.REPLAY, campaign_id=campaign, created_at=now, **failed)
+            session.add(row)
+        number = collect.id
+    open_campaign(page, studio, campaign)
+    page.locator(".live").get_by_text("rollouts · 25 %").wait_for()
+    note = page.locator("#jobs-note")
+    assert note.inner_text() == "0 queued · 1 running · 25 failed · 20 of them shown"
+    with studio.database.write() as session:
+        told = {"job_id": number, "kind": "collect", "progress": 0.5, "stage": "rollouts"}
+        add_event(session, now, campaign_id=campaign, kind="job", data=told, job_id=number)
+    page.locator(f'tr[data-job="{number}"]', has_text="50 %").wait_for()
+    assert page.get_by_role("progressbar").get_attribute("aria-valuenow") == "50"
+
+
+def test_page_says_that_no_worker_takes_what_waits(studio: Studio, page: Page) -> None:
+    campaign, now = studio.add_campaign([True]), datetime.now(UTC)
+    open_campaign(page, studio, campaign)
+    assert not page.locator("#system").is_visible(), "nothing waits"
+    with studio.database.write() as session:
+        number = campaigns.start_collect(session, now, campaign, {}, by=1).id
+    page.reload()
+    page.locator("#system").get_by_text("no worker for queue 'rollout'").wait_for()
+    page.locator(f'tr[data-job="{number}"]').get_by_role("button", name="Cancel").click()
+    page.get_by_role("button", name="Keep it").wait_for()
+    confirm(page, "Cancel job")
+    page.locator("#system").wait_for(state="hidden")
+
+
+def test_times_are_whole_seconds(studio: Studio, page: Page) -> None:
+    page.goto(f"{studio.url}/sign-in")
+    told = page.evaluate(
+        """async (all) => all.map((await import("/static/format.js")).duration)""",
+        [9_940, 99_700, 119_600, 3_600_000],
+    )
+    assert told == ["9.9 s", "1 min 40 s", "2 min 0 s", "60 min 0 s"]

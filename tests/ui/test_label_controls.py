@@ -39,6 +39,19 @@ def test_arrows_in_the_account_menu_do_not_judge(studio: Studio, label_page: Ope
     assert studio.wait_for_labels(driver.campaign_id, 1)[0].choice == Choice.CANNOT_TELL
 
 
+def test_escape_closes_the_account_menu_and_gives_the_focus_back(
+    studio: Studio, page: Page, label_page: Opened
+) -> None:
+    driver = label_page(studio.add_campaign([True]))
+    page.get_by_label("Account of").focus()
+    driver.press("Enter")
+    driver.press("Tab")
+    driver.press("Escape")
+    page.get_by_role("button", name="Sign out").wait_for(state="hidden")
+    assert page.evaluate("document.activeElement.matches('.menu > summary')")
+    assert page.locator("dialog[open]").count() == 0
+
+
 def test_arrows_on_help_and_on_the_notes_undo_do_not_judge(
     studio: Studio, label_page: Opened
 ) -> None:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import io
+import time
 from collections.abc import Callable
 
+import numpy as np
 import pytest
-from playwright.sync_api import Page, Route
+from PIL import Image
+from playwright.sync_api import BrowserContext, Page, Route
 from sqlalchemy import select
 
 from server.store.tables import Event, Lease, Pair
-from tests.ui.driving import LabelPage, take_session, until
+from tests.ui.driving import PATIENCE, LabelPage, take_session, until
 from tests.ui.studio import Studio
 
 pytestmark = pytest.mark.browser
 Opened = Callable[[int], LabelPage]
 
 REPLAYS = "**/replays/*.viser"
+NEXT_IS_LOADED = """[...document.querySelectorAll("iframe.waiting")].some(
+  (frame) => frame.contentDocument?.querySelector("[role=slider]"))"""
 
 
 def _address(studio: Studio, campaign: int, index: int) -> str:
@@ -94,3 +100,46 @@ def test_replay_refused_after_the_session_ended_asks_to_sign_in(studio: Studio, 
     driver.open(campaign, ready=False)
     page.get_by_role("heading", name="You are signed out").wait_for()
     assert page.locator("#stage-note").get_by_role("link", name="Sign in").is_visible()
+
+
+def _red_share(page: Page) -> float:
+    """Share of the stage in the red of the cylinders, which stand in every replay of the task."""
+    picture = page.locator("#stage").screenshot(timeout=1000 * PATIENCE)
+    red, green, blue = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"), int).T
+    return float(((red > 120) & (green < 90) & (blue < 90)).mean())
+
+
+def test_a_replay_that_waited_is_drawn_although_nothing_plays_yet(
+    studio: Studio, label_page: Opened, page: Page
+) -> None:
+    driver = label_page(studio.add_campaign([True, True]))
+    until(page, NEXT_IS_LOADED)
+    driver.press("ArrowLeft")
+    driver.wait_ready()
+    deadline = time.monotonic() + PATIENCE
+    while (share := _red_share(page)) < 0.002:
+        assert time.monotonic() < deadline, share
+    state = driver.wait_state("state.paused")
+    assert state["t"] == 0, "the system asks for less motion: it waits at the start"
+    driver.press("Space")
+    driver.wait_state("!state.paused && state.t > 0")
+
+
+def test_page_goes_on_when_its_person_has_signed_in_again_in_another_tab(
+    studio: Studio, label_page: Opened, context: BrowserContext, page: Page
+) -> None:
+    campaign = studio.add_campaign([True, True, True])
+    driver = label_page(campaign)
+    until(page, NEXT_IS_LOADED)
+    context.clear_cookies()
+    for done in ("1 of 3", "2 of 3"):
+        driver.wait_ready()
+        driver.press("ArrowLeft")
+        assert page.locator("#progress-text").inner_text() == done, "also without an answer"
+    page.get_by_role("heading", name="You are signed out").wait_for()
+    take_session(page, studio, driver.name)
+    page.evaluate(
+        "document.dispatchEvent(new Event('visibilitychange'))"
+    )  # back from the other tab
+    driver.wait_ready()
+    assert len(studio.labels(campaign)) == 2

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 from playwright.sync_api import ConsoleMessage, Page
 
+from server.store.tables import Campaign
 from tests.ui.driving import LabelPage, take_session, until
 from tests.ui.studio import Studio
 
@@ -103,6 +104,24 @@ def test_pages_fit_a_phone_and_every_control_has_a_name(
           .map((item) => item.outerHTML)"""
     )
     assert nameless == []
+
+
+@pytest.mark.parametrize("path", ["/label", "/admin", "/admin/campaigns/{id}", "/label/{id}"])
+def test_pages_fit_a_phone_however_long_the_names_are(
+    studio: Studio, page: Page, path: str
+) -> None:
+    campaign, other = studio.add_campaign([True]), studio.add_campaign()
+    long = "x" * 100
+    page.set_viewport_size({"width": 390, "height": 844})
+    take_session(page, studio, "admin")
+    with studio.database.write() as session:
+        for number in (campaign, other):
+            row = session.get_one(Campaign, number)
+            row.name, row.criterion = f"{studio.new_name(long)}", f"{long} {long}"
+    page.goto(studio.url + path.format(id=campaign))
+    until(page, "!document.body.innerText.includes('Loading…')")
+    page.wait_for_timeout(500)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 # What a click or a key would reach: visible, enabled, and not below a part that is switched off.

@@ -15,4 +15,9 @@ const menu = find(".menu");
 document.addEventListener("click", (event) => {
   if (!menu.contains(event.target)) menu.open = false;
 });
+document.addEventListener("keydown", (event) => {
+  if (event.key !== "Escape" || !menu.open) return;
+  if (menu.contains(document.activeElement)) find("summary", menu).focus(); // what it was on is gone
+  menu.open = false;
+});
 enable("#sign-out");

@@ -1,7 +1,7 @@
 // The list of campaigns, and the dialog that makes a new one.
 
 import { ApiError, get, post, signInAddress } from "./api.js";
-import { ask, describe, element, enable, find, replace } from "./dom.js";
+import { ask, describe, element, enable, find, replace, toast } from "./dom.js";
 import { count, words } from "./format.js";
 import { addPerson, drawPeople } from "./people.js";
 
@@ -58,7 +58,7 @@ async function create() {
     tasks = await get("/tasks");
     policies = tasks.length > 0 ? await startPolicies(tasks[0]) : [];
   } catch (error) {
-    replace(box, element("p.form-error", { role: "alert" }, describe(error)));
+    toast(describe(error), { bad: true, seconds: 12 }); // the campaigns stay on the page
     return;
   }
   const made = {};

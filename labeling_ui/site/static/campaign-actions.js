@@ -132,6 +132,7 @@ export function campaignActions(id, data, refresh) {
     title: `Cancel round ${round.id}?`,
     text: "The labels stay, and count as new again.",
     confirm: "Cancel round",
+    dismiss: "Let it run",
     danger: true,
     onSubmit: () => post(`/rounds/${round.id}/cancel`),
   });

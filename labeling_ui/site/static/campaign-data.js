@@ -4,8 +4,8 @@ import { get } from "./api.js";
 
 const PAIRS_AT_ONCE = 24;
 const ROWS_AT_ONCE = 50; // of rounds and of checkpoints
-const JOBS_AT_ONCE = 20; // of each of these states:
-const JOB_STATES = ["failed", "running", "queued"];
+const JOBS_AT_ONCE = 20; // of each of these states, what runs first: however much has failed, it is seen
+const JOB_STATES = ["running", "failed", "queued"];
 
 export const PARTS = ["campaign", "stats", "rounds", "jobs", "checkpoints", "pairs", "curves"];
 
@@ -45,7 +45,7 @@ export function campaignData(id) {
     rounds: () => loadNewest("rounds"),
     jobs: async () => {
       const path = (state) => `/jobs?campaign_id=${id}&state=${state}&limit=${JOBS_AT_ONCE}`;
-      data.jobs = (await Promise.all(JOB_STATES.map((state) => get(path(state))))).flat().slice(0, JOBS_AT_ONCE);
+      data.jobs = (await Promise.all(JOB_STATES.map((state) => get(path(state))))).flat();
     },
     checkpoints: async () => {
       await loadNewest("checkpoints");

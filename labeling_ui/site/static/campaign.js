@@ -9,11 +9,13 @@ import { describe, element, enable, find, replace } from "./dom.js";
 import { cancelJob } from "./job-actions.js";
 import { isRunning, liveCollect, liveRound, liveWords, showProgress } from "./live.js";
 import * as panels from "./panels.js";
+import { watchSystem } from "./readiness.js";
 import { renew } from "./steady.js";
 
 const id = document.body.dataset.campaignId;
 const REFRESH_MS = 900; // at most this often, however fast events come
 const IDLE_REFRESH_MS = 15_000; // should the event stream be cut by a proxy
+const JOBS_SHOWN = 20;
 const STREAM_PATIENCE_MS = 1000; // then the page is drawn without waiting for the stream
 
 const { data, load, loadMore, changedBy, events } = campaignData(id);
@@ -41,6 +43,7 @@ async function refresh(...parts) {
       draw();
       await drawShownRound(now.includes("curves"));
       find("#banner").hidden = true;
+      watchSystem(data.stats.jobs); // not awaited: it may take seconds, and tells by itself
     } catch (error) {
       complain(error);
     }
@@ -66,7 +69,10 @@ function follow() {
     stream.addEventListener(name, (event) => {
       const told = JSON.parse(event.data);
       const parts = changedBy(name, told);
-      if (name === "progress") showProgress(told);
+      if (name === "progress") {
+        showProgress(told);
+        if (data.stats) drawJobs(); // its row says the same
+      }
       if (parts.length > 0) refresh(...parts);
     });
   }
@@ -78,16 +84,16 @@ function follow() {
 
 const publishedId = () => data.campaign.published_checkpoint_id;
 
-// What is known of a checkpoint: as candidate of its round, as parent of a later one, or shipped.
+// What is known of a checkpoint: as candidate of its round, as parent of a later one, or shipped. Of
+// several measurements the one of most runs, so that a small round does not blur what is known.
 function evaluationOf(checkpoint) {
-  for (const round of data.rounds) {
-    if (round.candidate_checkpoint_id === checkpoint.id && round.result?.after) return round.result.after;
-  }
-  for (const round of data.rounds) {
-    if (round.parent_checkpoint_id === checkpoint.id && round.result?.before) return round.result.before;
-  }
   const { metrics } = checkpoint;
-  return [metrics.evaluation, metrics.measured, metrics].find((item) => typeof item?.success === "number") ?? null;
+  const known = [
+    ...data.rounds.filter((round) => round.candidate_checkpoint_id === checkpoint.id).map((round) => round.result?.after),
+    ...data.rounds.filter((round) => round.parent_checkpoint_id === checkpoint.id).map((round) => round.result?.before),
+    ...[metrics.evaluation, metrics.measured, metrics].filter((item) => typeof item?.success === "number").slice(0, 1),
+  ].filter(Boolean);
+  return known.reduce((best, other) => ((other.n ?? 0) > (best.n ?? 0) ? other : best), known[0] ?? null);
 }
 
 const taskFacts = () => data.published?.config.task_facts;
@@ -102,11 +108,16 @@ function shownRound() {
 function draw() {
   if (!data.stats || !data.published) return;
   const { campaign, stats, published } = data;
-  find("h1").textContent = campaign.name;
+  for (const place of ["h1", ".crumb:last-child"]) find(place).textContent = campaign.name;
+  document.title = `${campaign.name} · RoDiF Studio`;
   find("#archived").hidden = !campaign.archived;
   find("#published").textContent = `Published policy: ${published.name}`;
   find(".criterion-text").textContent = `“${campaign.criterion}”`;
   enable("#collect", "#settings", "#start-round"); // their dialogs show what has been loaded
+  for (const name of ["#collect", "#start-round"]) { // the server would refuse both
+    find(name).disabled = campaign.archived;
+    find(name).title = campaign.archived ? "The campaign is archived: see Settings" : "";
+  }
   find("#rollback").disabled = stats.rollback_checkpoint_id === null;
   renew(find("#tiles"), panels.tiles(stats, evaluationOf(published)));
   renew(find("#annotators"), panels.annotatorTable(stats.annotators));
@@ -147,8 +158,10 @@ async function showMore(name) {
 
 function drawJobs() {
   const { queued, running, failed } = data.stats.jobs;
-  find("#jobs-note").textContent = `${queued} queued · ${running} running · ${failed} failed`;
-  renew(find("#jobs"), panels.jobTable(data.jobs, { onRetry: actions.retry, onCancel: (job) => cancelJob(job, refresh) }));
+  const shown = data.jobs.slice(0, JOBS_SHOWN);
+  const part = queued + running + failed > shown.length ? ` · ${shown.length} of them shown` : "";
+  find("#jobs-note").textContent = `${queued} queued · ${running} running · ${failed} failed${part}`;
+  renew(find("#jobs"), panels.jobTable(shown, { onRetry: actions.retry, onCancel: (job) => cancelJob(job, refresh) }));
 }
 
 function drawLive() {

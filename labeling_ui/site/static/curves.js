@@ -17,15 +17,16 @@ function loadPlotly() {
 
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-function layout(title, axis) {
+// `updates`: of the longest line; few of them are told apart by whole numbers.
+function layout(title, updates, axis) {
   const line = css("--line");
   const font = { family: css("--font"), size: 12, color: css("--muted") };
   return {
     title: { text: title, font: { ...font, size: 14, color: css("--ink") }, x: 0, xref: "paper", xanchor: "left" },
     font, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     margin: { l: 48, r: 12, t: 36, b: 72 },
-    xaxis: { title: { text: "update", font, standoff: 8 }, gridcolor: line, zerolinecolor: line, rangemode: "tozero" },
-    yaxis: { gridcolor: line, zerolinecolor: line, ...axis },
+    xaxis: { title: { text: "update", font, standoff: 8 }, dtick: updates <= 10 ? 1 : null, gridcolor: line, zerolinecolor: line, rangemode: "tozero" },
+    yaxis: { gridcolor: line, zerolinecolor: line, rangemode: updates > 1 ? "normal" : "tozero", ...axis },
     showlegend: true,
     legend: { orientation: "h", x: 0, y: -0.26, yanchor: "top" },
     hovermode: "x unified",
@@ -52,6 +53,8 @@ function traces(points, value, colours, { relative = false } = {}) {
   }));
 }
 
+const longest = (lines) => Math.max(0, ...lines.map((line) => line.y.length));
+
 // Returns whether there was anything to draw.
 export async function drawCurves(points) {
   const colours = [css("--accent"), "#b07a1e", "#8a5fb0", "#5d7f3a", "#b3261e", "#56636f"];
@@ -62,10 +65,10 @@ export async function drawCurves(points) {
   const options = { displayModeBar: false, responsive: true };
   const box = find("#vote-chart");
   box.hidden = votes.length === 0;
-  await plotly.react(find("#loss-chart"), losses, layout("Loss, share of its first value", { tickformat: ".0%" }), options);
+  await plotly.react(find("#loss-chart"), losses, layout("Loss, share of its first value", longest(losses), { tickformat: ".0%" }), options);
   if (votes.length > 0) {
     const title = "Mean vote for the labelled winner";
-    await plotly.react(box, votes, layout(title, { tickformat: ".1%" }), options);
+    await plotly.react(box, votes, layout(title, longest(votes), { tickformat: ".1%" }), options);
   }
   return true;
 }

@@ -63,13 +63,14 @@ export function toast(text, { action = null, onAction = null, bad = false, secon
 // A question with optional fields. Resolves to an object of the fields' values, or null.
 //   fields: [{name, label, kind: "text" | "number" | "password" | "select" | "textarea", value, options, hint, …}]
 //     onChange: (value, form) => …, of a select
+//   dismiss: the other button, where "Cancel" would say the same as the question
 //   onSubmit: async (values) => …; an error it throws is shown in the dialog, which stays open
-export function ask({ title, text = "", fields = [], confirm = "OK", danger = false, onSubmit }) {
+export function ask({ title, text = "", fields = [], confirm = "OK", dismiss = "Cancel", danger = false, onSubmit }) {
   return new Promise((resolve) => {
     const error = element("p.form-error", { role: "alert", hidden: true });
     const rows = fields.map(fieldRow);
     const submit = element(`button.button.${danger ? "danger" : "primary"}`, { type: "submit" }, confirm);
-    const cancel = element("button.button", { type: "button", onclick: () => close(null) }, "Cancel");
+    const cancel = element("button.button", { type: "button", onclick: () => close(null) }, dismiss);
     const form = element(
       "form", {},
       element("h2", {}, title),

@@ -17,6 +17,7 @@ export async function cancelJob(job, refresh) {
     title: `Cancel ${job.kind} ${job.id}?`,
     text: LOSS[job.kind] ?? "",
     confirm: "Cancel job",
+    dismiss: "Keep it",
     danger: true,
     onSubmit: () => post(`/jobs/${job.id}/cancel`),
   });

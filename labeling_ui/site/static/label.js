@@ -162,6 +162,7 @@ function judge(choice) {
   if (history.length > MAX_HISTORY) history.shift();
   showUndo();
   if (progress) progress = { done: progress.done + 1, remaining: Math.max(0, progress.remaining - 1) };
+  showProgress(); // at once: without a connection there is no next pair that would show it
   leave(item);
   toast(CHOICES[choice], { action: "Undo", onAction: undo });
   showNext();
@@ -237,15 +238,27 @@ function tellNothing(reason) {
 function tellProblem(error) {
   const known = error instanceof ApiError || error instanceof OfflineError;
   const kind = known ? kindOf(error) : "final";
-  if (kind === "signedOut") return notes.signedOut();
+  if (kind === "signedOut") return tellSignedOut();
   if (kind === "final") return notes.problem("That did not work", describe(error), showNext);
   if (kind === "offline") notes.offline(showNext);
   else notes.busy(describe(error), showNext);
   retryTimer = setTimeout(showNext, RETRY_MS[kind]);
 }
 
+// Whoever signs in again in another tab and comes back finds the page at work.
+function tellSignedOut(retry = showNext) {
+  notes.signedOut();
+  const mine = turn;
+  const comeBack = () => {
+    if (document.visibilityState !== "visible") return;
+    document.removeEventListener("visibilitychange", comeBack);
+    if (mine === turn) retry();
+  };
+  document.addEventListener("visibilitychange", comeBack);
+}
+
 function tellFailedReplay(item, { message, status }) {
-  if (status === 401) return notes.signedOut();
+  if (status === 401) return tellSignedOut(() => show(item));
   const broken = item.player !== null;
   notes.failedReplay(message, {
     retry: () => show(item),

@@ -10,10 +10,11 @@ export const isRunning = (round) => RUNNING.includes(round.state);
 
 function meter(job) {
   const share = job?.progress ?? 0;
-  const now = { role: "progressbar", "aria-valuenow": Math.round(100 * share), "aria-valuemin": 0, "aria-valuemax": 100 };
+  const before = job?.state === "running" ? "starting" : "waiting for a worker";
+  const now = { role: "progressbar", "aria-label": "Progress of this stage", "aria-valuenow": Math.round(100 * share), "aria-valuemin": 0, "aria-valuemax": 100 };
   return [
     element("div.meter", now, element("div", { style: `width:${100 * share}%` })),
-    element("p.small.muted.live-stage", {}, job ? `${words(job.stage) || "waiting"} · ${percent(share)}` : "waiting for a worker"),
+    element("p.small.muted.live-stage", {}, job?.stage ? `${words(job.stage)} · ${percent(share)}` : before),
   ];
 }
 
@@ -59,5 +60,6 @@ export function showProgress({ job_id: jobId, progress, stage }) {
   const card = find(`.live[data-job="${jobId}"]`);
   if (!card || typeof progress !== "number") return;
   find(".meter > div", card).style.width = `${100 * progress}%`;
+  find(".meter", card).setAttribute("aria-valuenow", Math.round(100 * progress));
   find(".live-stage", card).textContent = `${words(stage)} · ${percent(progress)}`;
 }

@@ -92,6 +92,9 @@ export function noiseText(round) {
   );
 }
 
+// Beside the publishing rule "manual", "manual" would say the wrong thing.
+const TRIGGERS = { manual: "started by hand", labels: "enough new labels", periodic: "by the clock" };
+
 const arrow = (before, after, key) =>
   after ? `${percent(before?.[key])} → ${percent(after[key])}` : "–";
 
@@ -104,13 +107,13 @@ export function roundTable(rounds, selected, { onSelect, onPublish, publishedId 
       `tr${round.id === selected ? ".selected" : ""}`, { dataset: { key: round.id, round: round.id } },
       cell(element("button.link", { type: "button", onclick: () => onSelect(round.id) }, `Round ${round.id}`)),
       cell([pill(round.state), round.error ? under(element("span.error-text", {}, round.error)) : null]),
-      cell([round.config.method, under(round.publish_rule === "never" ? "comparison" : words(round.trigger))]),
+      cell([round.config.method, under(round.publish_rule === "never" ? "comparison" : TRIGGERS[round.trigger] ?? words(round.trigger))]),
       cell(count(round.labels), ".number"),
       cell(round.noise ? round.noise.conservativeness.toFixed(2) : "–", ".number"),
       cell(arrow(before, after, "success"), ".number"),
       cell(arrow(before, after, "alignment"), ".number"),
       cell(ago(round.created_at), ".tight"),
-      cell(mayPublish ? element("button.button.small", { type: "button", onclick: () => onPublish(round.candidate_checkpoint_id) }, "Publish") : null, ".tight"),
+      cell(mayPublish ? element("button.button.small", { type: "button", "aria-label": `Publish the policy of round ${round.id}`, onclick: () => onPublish(round.candidate_checkpoint_id) }, "Publish") : null, ".tight"),
     );
   });
   const heads = [
@@ -133,10 +136,10 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
       cell(rate("success"), ".number"), cell(rate("alignment"), ".number"), cell(rate("off_support"), ".number"),
       cell(ago(checkpoint.created_at), ".tight"),
       cell([
-        element("button.button.small", { type: "button", onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
+        element("button.button.small", { type: "button", "aria-label": `Lineage of ${checkpoint.name}`, onclick: () => onLineage(checkpoint) }, "Lineage"), " ",
         element("a.button.small", { href: `/api/v1/checkpoints/${checkpoint.id}/file`, download: "", "aria-label": `Download ${checkpoint.name}` }, "Download"), " ",
         published || checkpoint.comparison ? null
-          : element("button.button.small", { type: "button", onclick: () => onPublish(checkpoint.id) }, "Publish"),
+          : element("button.button.small", { type: "button", "aria-label": `Publish ${checkpoint.name}`, onclick: () => onPublish(checkpoint.id) }, "Publish"),
       ], ".tight"),
     );
   });
@@ -146,7 +149,8 @@ export function checkpointTable(checkpoints, { publishedId, evaluationOf, onLine
 
 // What can be done about a job by hand, if anything.
 function jobButton(job, onRetry, onCancel) {
-  const button = (name, onclick) => element("button.button.small", { type: "button", onclick }, name);
+  const what = `${words(job.kind)} ${job.id}`;
+  const button = (name, onclick) => element("button.button.small", { type: "button", "aria-label": `${name} ${what}`, onclick }, name);
   if (job.state === "failed") return button("Retry", () => onRetry(job));
   return canBeCancelled(job) ? button("Cancel", () => onCancel(job)) : null;
 }
@@ -156,7 +160,7 @@ export function jobTable(jobs, { onRetry, onCancel }) {
     "tr", { dataset: { key: job.id, job: job.id } },
     cell(`${words(job.kind)} ${job.id}`),
     cell([pill(job.state), job.error ? under(element("span.error-text", {}, job.error)) : null]),
-    cell([job.stage, job.state === "running" ? under(percent(job.progress)) : null]),
+    cell([words(job.stage), job.state === "running" ? under(percent(job.progress)) : null]),
     cell(job.attempt, ".number"),
     cell(ago(job.finished_at ?? job.started_at ?? job.created_at), ".tight"),
     cell(jobButton(job, onRetry, onCancel), ".tight"),

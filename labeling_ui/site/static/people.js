@@ -19,10 +19,12 @@ export async function drawPeople() {
 }
 
 function row(person) {
-  const change = (text, action) => element("button.button.small", { type: "button", onclick: action }, text);
+  const name = `person-${person.id}`; // says whose buttons these are, to who does not see the row
+  const change = (text, action) =>
+    element("button.button.small", { type: "button", "aria-describedby": name, onclick: action }, text);
   return element(
     "tr", { dataset: { person: person.id } },
-    element("td", {}, person.name, person.active ? null : element("span.under", {}, "deactivated")),
+    element("td", { id: name }, person.name, person.active ? null : element("span.under", {}, "deactivated")),
     element("td", {}, person.role, person.kind === "simulated" ? element("span.under", {}, "simulated") : null),
     element("td.number", {}, count(person.labels)),
     element(
@@ -30,6 +32,15 @@ function row(person) {
       person.active ? change("Deactivate", () => deactivate(person)) : change("Activate", () => activate(person)),
     ),
   );
+}
+
+// After a dialog: what has changed is stored already, so not being able to show it loses nothing.
+async function redraw() {
+  try {
+    await drawPeople();
+  } catch (error) {
+    toast(describe(error), { bad: true, seconds: 12 });
+  }
 }
 
 const patch = (person, body) => request("PATCH", `/annotators/${person.id}`, { body });
@@ -46,7 +57,7 @@ export async function addPerson() {
     onSubmit: (values) => post("/annotators", values),
   });
   if (made) toast(`${made.name} can sign in now.`);
-  await drawPeople();
+  await redraw();
 }
 
 async function setPassword(person) {
@@ -58,7 +69,7 @@ async function setPassword(person) {
     onSubmit: ({ password }) => patch(person, { password }),
   });
   if (done) toast("The password is changed.");
-  await drawPeople();
+  await redraw();
 }
 
 async function deactivate(person) {
@@ -69,14 +80,14 @@ async function deactivate(person) {
     danger: true,
     onSubmit: () => patch(person, { active: false }),
   });
-  await drawPeople();
+  await redraw();
 }
 
 async function activate(person) {
   try {
     await patch(person, { active: true });
     toast(`${person.name} can sign in again.`);
-    await drawPeople();
+    await redraw();
   } catch (error) {
     toast(describe(error), { bad: true, seconds: 12 });
   }

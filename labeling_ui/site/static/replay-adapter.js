@@ -216,6 +216,7 @@
     settle();
     if (!ready) {
       ready = true;
+      if (wantPaused) seek(0); // before it plays or seeks, the client shows nothing of the recording
       post({ kind: "replay-ready", duration: duration() });
     }
     const state = {

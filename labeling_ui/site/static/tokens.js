@@ -1,7 +1,7 @@
 // Tokens for scripts: made for an account, shown once, listed without the secret, revoked.
 
 import { getAll, post, request } from "./api.js";
-import { ask, element, find, replace, show, toast } from "./dom.js";
+import { ask, describe, element, find, replace, show, toast } from "./dom.js";
 import { ago, day } from "./format.js";
 import { table } from "./panels.js";
 
@@ -15,14 +15,23 @@ export async function drawTokens(people) {
   replace(find("#tokens"), table(heads, rows, "None. Scripts and the rodif commands sign in with a token."));
 }
 
+async function redraw(people) {
+  try {
+    await drawTokens(people);
+  } catch (error) {
+    toast(describe(error), { bad: true, seconds: 12 });
+  }
+}
+
 function row(token, owner, people) {
+  const name = `token-${token.id}`;
   return element(
     "tr", { dataset: { token: token.id } },
-    element("td", {}, token.name),
+    element("td", { id: name }, token.name),
     element("td", {}, owner),
     element("td", {}, token.last_used_at ? ago(token.last_used_at) : "never"),
     element("td", {}, day(token.expires_at)),
-    element("td.tight", {}, element("button.button.small", { type: "button", onclick: () => revoke(token, owner, people) }, "Revoke")),
+    element("td.tight", {}, element("button.button.small", { type: "button", "aria-describedby": name, onclick: () => revoke(token, owner, people) }, "Revoke")),
   );
 }
 
@@ -49,7 +58,7 @@ export async function addToken(people) {
     element("p.muted", {}, "Copy it now: it is not shown again."),
     element("p", {}, element("code.secret", {}, made.token)),
   );
-  await drawTokens(people);
+  await redraw(people);
 }
 
 async function revoke(token, owner, people) {
@@ -61,5 +70,5 @@ async function revoke(token, owner, people) {
     onSubmit: () => request("DELETE", `/tokens/${token.id}`),
   });
   if (done) toast("The token is revoked.");
-  await drawTokens(people);
+  await redraw(people);
 }
