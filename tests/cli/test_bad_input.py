@@ -84,7 +84,7 @@ def test_a_damaged_checkpoint_is_named(
     [
         (["plot", "modes", "avoid", "--out", "a.jpg"], "out is 'a.jpg', but must be.*.png"),
         (["pretrain", "avoid", "--out", "x", "--executed-steps", "17"], "executed_steps is 17"),
-        (["round", "--minutes", "-1"], "minutes is -1.0, but must be above 0"),
+        (["round", "--minutes", "-1"], "minutes is -1.0, but must be at least 0"),
         (["simulate", "--seed", "-1"], "seed is -1, but must be at least 0"),
         (["up", "--port", "99999"], "port is 99999: .*less than or equal to 65535"),
     ],

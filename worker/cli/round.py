@@ -96,8 +96,8 @@ def run(args: argparse.Namespace) -> int:
 
     from worker.cli.tables import evaluation_table
 
-    if not args.minutes > 0:  # before the round is started, which nobody would then follow
-        raise ValueOutOfRangeError("minutes", args.minutes, "above 0")
+    if not args.minutes >= 0:  # before the round is started, which nobody would then follow
+        raise ValueOutOfRangeError("minutes", args.minutes, "at least 0")
     # What is not given must not be sent: zero is a seed of rollouts that were labelled.
     given = {"episodes": args.episodes, "seed": args.seed}
     evaluation = {name: value for name, value in given.items() if value is not None}
