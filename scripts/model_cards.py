@@ -67,7 +67,7 @@ def measurement(checkpoint: Checkpoint) -> dict[str, Any]:
 
 def _row(checkpoint: Checkpoint) -> str:
     task, measured = get_task(checkpoint.task), measurement(checkpoint)
-    paper = PAPER_SUCCESS[task.name.value.removesuffix("-state")]
+    paper = PAPER_SUCCESS.get(task.name.value.removesuffix("-state"))
     cells = [
         f"[`{task.name.value}`](#{task.name.value})",
         f"{measured['success']:.1%} {_interval(measured, 'success')}",
@@ -75,7 +75,7 @@ def _row(checkpoint: Checkpoint) -> str:
         f" {_interval(measured, 'alignment_of_successes')}",
         f"{measured['off_support']:.1%}",
         str(measured["n"]),
-        f"{paper} %",
+        "–" if paper is None else f"{paper} %",
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -94,11 +94,15 @@ def _card(checkpoint: Checkpoint) -> str:
     return (
         f"\n## {name}\n"
         f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}"
-        f" Up to {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
+        f"{_minutes(name)} Digest `{checkpoint.digest[:16]}`.\n"
         f"```\nrodif pretrain {name} --preset cpu --demonstrations {shown}"
         f" --evaluate {measurement(checkpoint)['n']} --out {name}.safetensors\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
     )
+
+
+def _minutes(name: str) -> str:
+    return f" Up to {CPU_MINUTES[name]} CPU minutes in all." if name in CPU_MINUTES else ""
 
 
 def _data(card: dict[str, Any], shown: int) -> str:
