@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rodif_core.demonstrations import Recording
-from rodif_core.errors import DemonstrationFileError, ValueOutOfRangeError
+from rodif_core.errors import DemonstrationFileError, UnknownNameError, ValueOutOfRangeError
 from rodif_core.plain_pickle import StoredArray, read_plain_pickle
 from rodif_core.spec import TaskName
 from rodif_core.tasks import Task
@@ -111,6 +111,7 @@ class Format:
 
 _ALIGNING = Format({"box": "push-box", "target": "target-box"}, _spatial)
 _STACKING = Format({"red": "red-box", "green": "green-box", "blue": "blue-box"}, _joints)
+# Of the tasks that D3IL has, by their names here.
 FORMATS: dict[TaskName, Format] = {
     TaskName.AVOID: Format({}, _planar),
     TaskName.PUSHING: Format({"red": "red-box", "green": "green-box"}, _planar),
@@ -139,11 +140,13 @@ def episode_files(paths: Sequence[Path]) -> list[Path]:
 
 def read_episode(task: TaskName, path: Path) -> D3ilEpisode:
     """Read one file; raises DemonstrationFileError when it is damaged, holds more than plain data
-    or is of another task."""
+    or is of another task, and UnknownNameError for a task that D3IL has not."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise DemonstrationFileError(f"cannot read {path}: {error.strerror}") from error
+    if task not in FORMATS:
+        raise UnknownNameError("task with D3IL files", task.value, FORMATS)
     record = _Record(str(path), read_plain_pickle(data, str(path)))
     start = record.rows("robot", "des_c_pos", 2)[0]
     context: dict[str, Any] = {"start": start.tolist()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,6 +67,7 @@ def make_demonstrations(
     if not 0 <= share <= 1:
         raise ValueOutOfRangeError("preferred_share", share, "in [0, 1]")
     made: dict[int, Trajectory] = {}
+    ends: Counter[str] = Counter()  # of the failures, to tell what an expert does wrong
     env = BatchEnv(task, min(PARALLEL, episodes))
     waiting = [
         _Assignment(i, mode, 0) for i, mode in enumerate(assign_modes(task, episodes, share))
@@ -75,17 +77,25 @@ def make_demonstrations(
         for assignment, trajectory in zip(batch, _demonstrate(env, batch, seed), strict=True):
             if trajectory.success and trajectory.outcome["mode"] == assignment.mode:
                 made[assignment.index] = trajectory
-            elif assignment.attempt + 1 == MAX_ATTEMPTS:
+                continue
+            ends[_failure(trajectory)] += 1
+            if assignment.attempt + 1 == MAX_ATTEMPTS:
+                told = ", ".join(f"{end} {count}" for end, count in ends.most_common())
                 raise LearningError(
-                    f"the expert failed {MAX_ATTEMPTS} times in mode {assignment.mode}"
+                    f"the expert failed {MAX_ATTEMPTS} times in mode {assignment.mode!r}; the"
+                    f" failures of all modes so far: {told}"
                 )
-            else:
-                waiting.append(
-                    _Assignment(assignment.index, assignment.mode, assignment.attempt + 1)
-                )
+            waiting.append(_Assignment(assignment.index, assignment.mode, assignment.attempt + 1))
         if progress is not None:
             progress(len(made), episodes)
     return [made[index] for index in range(episodes)]
+
+
+def _failure(trajectory: Trajectory) -> str:
+    """How a demonstration went wrong, in words."""
+    if trajectory.success:
+        return f"succeeded in mode {trajectory.outcome['mode']!r} instead"
+    return str(trajectory.outcome["reason"]).replace("_", " ")
 
 
 def assign_modes(task: Task, episodes: int, preferred_share: float) -> list[str]:

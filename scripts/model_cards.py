@@ -67,7 +67,7 @@ def measurement(checkpoint: Checkpoint) -> dict[str, Any]:
 
 def _row(checkpoint: Checkpoint) -> str:
     task, measured = get_task(checkpoint.task), measurement(checkpoint)
-    paper = PAPER_SUCCESS[task.name.value.removesuffix("-state")]
+    paper = PAPER_SUCCESS.get(task.name.value.removesuffix("-state"))
     cells = [
         f"[`{task.name.value}`](#{task.name.value})",
         f"{measured['success']:.1%} {_interval(measured, 'success')}",
@@ -75,7 +75,7 @@ def _row(checkpoint: Checkpoint) -> str:
         f" {_interval(measured, 'alignment_of_successes')}",
         f"{measured['off_support']:.1%}",
         str(measured["n"]),
-        f"{paper} %",
+        "–" if paper is None else f"{paper} %",
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -96,7 +96,7 @@ def _card(checkpoint: Checkpoint) -> str:
     return (
         f"\n## {name}\n"
         f"`{config.architecture.value}` with {weights:,} weights; {shape}. {data}"
-        f" Up to {CPU_MINUTES[name]} CPU minutes in all. Digest `{checkpoint.digest[:16]}`.\n"
+        f"{_minutes(name)} Digest `{checkpoint.digest[:16]}`.\n"
         f"```\n{_commands(checkpoint, shown)}\n```\n"
         f"Modes of the successes: {_modes(checkpoint)}.\n"
     )
@@ -128,6 +128,10 @@ def _went_on(card: dict[str, Any]) -> str:
         f" after takeovers ({card['recoveries']}) from it and from {rollouts:,} rollouts of copies"
         " that each go one group's way ([tasks.md](tasks.md#what-made-them-learnable))."
     )
+
+
+def _minutes(name: str) -> str:
+    return f" Up to {CPU_MINUTES[name]} CPU minutes in all." if name in CPU_MINUTES else ""
 
 
 def _data(card: dict[str, Any], shown: int) -> str:

@@ -67,6 +67,26 @@ def default_text(value: object) -> str:
     return f"{value:g} |"
 
 
+@pytest.mark.parametrize("page", ["api.md", "commands.md", "configuration.md", "equations.md"])
+def test_every_method_stands_where_methods_are_listed(page: str):
+    text = text_of(page)
+    missing = [name for name in spec.FinetuneMethod if not re.search(rf"`{name}(_loss)?`", text)]
+    assert missing == []
+
+
+def test_the_dialogs_offer_every_method():
+    script = (ROOT / "labeling_ui/site/static/campaign-actions.js").read_text()
+    offered = re.search(r"const METHODS = \[(.*?)\n\];", script, flags=re.DOTALL)
+    assert offered, "no METHODS"
+    names = re.findall(r'^\s*\["(\w+)",', offered.group(1), flags=re.MULTILINE)
+    assert names == [name.value for name in spec.FinetuneMethod]
+
+
+@pytest.mark.parametrize("architecture", spec.Architecture)
+def test_every_architecture_has_a_row(architecture: spec.Architecture):
+    assert f"| `{architecture.value}` |" in text_of("architectures.md")
+
+
 @pytest.mark.parametrize("config", [CampaignSettings, CollectSettings])
 def test_every_campaign_setting_is_documented(config: type):
     text = text_of("configuration.md")

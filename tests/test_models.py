@@ -17,7 +17,7 @@ from scripts import model_cards
 MOST_BYTES = 20_000_000  # larger files do not belong into the repository
 # The paper's own pretrained policies; ours may not be worse.
 LEAST_SUCCESS = {
-    task: model_cards.PAPER_SUCCESS[task.removesuffix("-state")] / 100 for task in TaskName
+    task: model_cards.PAPER_SUCCESS.get(task.removesuffix("-state"), 0) / 100 for task in TaskName
 }
 
 

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
+from sqlalchemy.exc import ArgumentError, OperationalError
 
+from rodif_core.errors import RodifError
 from rodif_core.shipped import shipped_checkpoint, shipped_tasks
 from rodif_core.spec import TaskName
 from server.bootstrap import ensure_admin, register_checkpoint
@@ -50,8 +52,17 @@ def prepare(
 
     `admin_password` None keeps the present password, or makes a random one for a new account.
     Where there is no campaign yet, one on the task `first_campaign` is made, named like it.
+    Raises RodifError for a database that cannot be used.
     """
-    upgrade(settings.database_url)
+    try:
+        upgrade(settings.database_url)
+    except (ArgumentError, OperationalError) as error:
+        # The URL is not told: it may hold a password.
+        reason = getattr(error, "orig", None) or error
+        raise RodifError(
+            f"the database of RODIF_DATABASE_URL cannot be used: {reason}; legal are"
+            " sqlite:///FILE and postgresql+psycopg://USER:PASSWORD@HOST/NAME"
+        ) from error
     database = Database(settings.database_url)
     try:
         with database.write() as session:

@@ -112,7 +112,11 @@ class PolicyConfig:
 
 
 def build_denoiser(config: PolicyConfig) -> DenoiserModule:
-    """The network of a configuration, with fresh weights from torch's current random state."""
+    """The network of a configuration, with fresh weights from torch's current random state.
+
+    To add one, write it here, in `ARCHITECTURES`, `Size` and `DenoiserModule`
+    (docs/architectures.md).
+    """
     dims = {
         "action_dim": config.action_dim,
         "observation_dim": config.observation_dim,

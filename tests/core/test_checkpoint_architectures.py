@@ -30,7 +30,10 @@ def test_checkpoint_from_before_there_were_architectures_keeps_its_digest_and_by
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"architecture": "gru"}, "unknown architecture 'gru'.*'unet', 'transformer', 'mlp'"),
+        (
+            {"architecture": "nonesuch"},
+            "unknown architecture 'nonesuch'.*'unet', 'transformer', 'mlp'",
+        ),
         ({"depth": 3}, "unknown unet policy field 'depth'.*'channels'"),
         ({"channels": [16, 20]}, "channels is .16, 20.*multiples of 8"),
         ({"channels": [8, 16, 32]}, "size mismatch"),

@@ -11,7 +11,7 @@ import pytest
 
 from rodif_core.d3il import FORMATS, REFUSED_START, episode_files, read_episode, replay
 from rodif_core.demonstrations import make_demonstrations
-from rodif_core.errors import DemonstrationFileError
+from rodif_core.errors import DemonstrationFileError, UnknownNameError
 from rodif_core.spec import TaskName
 from rodif_core.tasks import TASKS, get_task
 from rodif_core.trajectory import Trajectory
@@ -48,7 +48,7 @@ def test_set_points_become_the_actions_that_follow_them(shown: list[Trajectory],
         assert one.info["file"].startswith("env_") and one.info["mode"] == one.outcome["mode"]
 
 
-@pytest.mark.parametrize("name", [name for name in TASKS if name is not TaskName.AVOID])
+@pytest.mark.parametrize("name", [name for name in FORMATS if name is not TaskName.AVOID])
 def test_every_task_reads_its_own_files(name: TaskName, tmp_path: Path):
     task = get_task(name)
     shown = make_demonstrations(task, episodes=1, seed=1)
@@ -58,8 +58,11 @@ def test_every_task_reads_its_own_files(name: TaskName, tmp_path: Path):
     assert made[0].qpos.shape[1] == shown[0].qpos.shape[1]
 
 
-def test_every_task_has_a_format():
-    assert set(FORMATS) >= set(TASKS)
+def test_a_task_that_d3il_has_not_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert set(FORMATS) <= set(TASKS)
+    monkeypatch.delitem(FORMATS, TaskName.AVOID)
+    with pytest.raises(UnknownNameError, match="task with D3IL files 'avoid'.*'pushing'"):
+        read_episode(TaskName.AVOID, write_record(tmp_path / "x.pkl", {}))
 
 
 def test_steps_that_are_too_long_are_clipped_and_made_up_for(

@@ -24,9 +24,11 @@ from rodif_core.errors import (
     UnknownNameError,
     ValueOutOfRangeError,
 )
+from rodif_core.spec import TaskName
 from rodif_core.tasks import get_task
 from rodif_core.tasks.avoid import START, AvoidTask
 from rodif_core.tasks.env import BatchEnv
+from rodif_core.tasks.experts import EXPERTS
 from rodif_core.tasks.experts.avoid import MIN_CLEARANCE, AvoidExpert
 from rodif_core.trajectory import Trajectory
 
@@ -169,7 +171,9 @@ def test_a_demonstration_that_fails_is_drawn_again(monkeypatch: pytest.MonkeyPat
 def test_an_expert_that_keeps_failing_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AvoidExpert, "tremble", 0.2)
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
-    with pytest.raises(LearningError, match="failed 2 times in mode L-11"):
+    with pytest.raises(
+        LearningError, match="failed 2 times in mode .L-11.; the failures of all modes"
+    ):
         make_demonstrations(TASK, episodes=1, seed=0, preferred_share=1.0)
 
 
@@ -274,3 +278,21 @@ def test_a_set_with_a_foreign_header_says_what_is_wrong(
 def test_an_empty_set_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueOutOfRangeError, match="demonstrations is 0"):
         save_demonstrations(tmp_path / "set.npz", [])
+
+
+def test_an_expert_that_keeps_failing_is_told_with_how_its_episodes_ended(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
+    # One that drives for another mode than it was asked for.
+    monkeypatch.setitem(
+        EXPERTS, TaskName.AVOID, lambda _mode, context, rng: AvoidExpert.draw("L-11", context, rng)
+    )
+    with pytest.raises(LearningError, match="failed 2 times in mode 'R-.*succeeded in mode 'L-11'"):
+        make_demonstrations(get_task("avoid"), episodes=2, seed=3, preferred_share=0.0)
+
+
+def test_a_task_without_an_expert_is_refused_by_its_name(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delitem(EXPERTS, TaskName.AVOID)
+    with pytest.raises(UnknownNameError, match="unknown task with an expert 'avoid'.*'pushing'"):
+        make_demonstrations(get_task("avoid"), episodes=1, seed=0)

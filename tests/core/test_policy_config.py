@@ -55,7 +55,10 @@ def test_json_of_the_others_names_the_architecture_and_its_own_sizes_only() -> N
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"architecture": "gru"}, "unknown architecture 'gru'.*'unet', 'transformer', 'mlp'"),
+        (
+            {"architecture": "nonesuch"},
+            "unknown architecture 'nonesuch'.*'unet', 'transformer', 'mlp'",
+        ),
         ({"size": {"width": 8}}, "unknown mlp policy field 'size'"),
         ({"channels": [16]}, "unknown mlp policy field 'channels'.*'width', 'blocks'"),
     ],

@@ -17,7 +17,7 @@ from rodif_core.errors import RodifError
 from rodif_core.spec import FinetuneMethod, TaskName
 from worker.cli.benchmarks import avoid, rollouts
 from worker.cli.benchmarks.rollout_tables import parts_table, rates_table
-from worker.cli.options import number_list
+from worker.cli.options import names, number_list, output_file
 from worker.parallel import pool_of
 
 if TYPE_CHECKING:
@@ -38,7 +38,9 @@ def read_rows(path: Path) -> list[Row]:
         rows = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise RodifError(f"{path} is not a benchmark's JSON file: {error}") from error
-    if not isinstance(rows, list) or any(FIELDS - set(row) for row in rows):
+    if not isinstance(rows, list) or not all(
+        isinstance(row, dict) and row.keys() >= FIELDS for row in rows
+    ):
         raise RodifError(f"{path} is not a list of benchmark rows with {', '.join(sorted(FIELDS))}")
     return rows
 
@@ -147,7 +149,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("bench", help="compare the fine-tuners; time rollouts")
     kinds = parser.add_subparsers(dest="what", required=True)
     fine = kinds.add_parser(TaskName.AVOID.value, help="the fine-tuners on fresh seeds")
-    fine.add_argument("--json", type=Path, required=True, help="file of rows; kept and completed")
+    fine.add_argument(
+        "--json", type=output_file, required=True, help="file of rows; kept and completed"
+    )
     fine.add_argument(
         "--seeds",
         type=number_list,
@@ -165,7 +169,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     fine.add_argument(
         "--methods",
         nargs="+",
-        choices=[method.value for method in FinetuneMethod],
+        choices=names(FinetuneMethod),
         default=[method.value for method in avoid.METHODS],
         help=f"(default {' '.join(avoid.METHODS)})",
     )
@@ -173,11 +177,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     fine.add_argument("--updates", type=int, help="full-batch updates of the literal methods")
     fine.add_argument("--workers", type=int, default=2, help="processes (default %(default)s)")
     timing = kinds.add_parser("rollouts", help="how quick rollouts are")
-    timing.add_argument("--json", type=Path, help="file of rows to write")
+    timing.add_argument("--json", type=output_file, help="file of rows to write")
     timing.add_argument(
         "--tasks",
         nargs="+",
-        choices=list(TaskName),
+        choices=names(TaskName),
         metavar="TASK",
         help="(default: all that are not seen through cameras)",
     )

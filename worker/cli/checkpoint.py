@@ -11,10 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import CheckpointFileError, RodifError
-from server.settings import Settings
-from worker.cli.options import add_connection_arguments, add_json_argument, connect, give_json
+from worker.cli.options import (
+    add_connection_arguments,
+    add_json_argument,
+    connect,
+    give_json,
+    output_file,
+    read_settings,
+)
 
 if TYPE_CHECKING:
+    from server.settings import Settings
     from worker.registry import Registered
 
 
@@ -33,7 +40,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     get.add_argument(
         "id", type=int, nargs="?", help="its number (default: what the campaign publishes)"
     )
-    get.add_argument("--out", type=Path, required=True, help="file to write (.safetensors)")
+    get.add_argument("--out", type=output_file, required=True, help="file to write (.safetensors)")
     add_connection_arguments(get)
     add_json_argument(get)
 
@@ -48,7 +55,7 @@ def _add(args: argparse.Namespace) -> int:
     from worker.registry import add_checkpoint
 
     given: dict[str, Any] = {} if args.state is None else {"state_dir": args.state}
-    settings = Settings(**given)
+    settings = read_settings(**given)
     found = add_checkpoint(settings, args.file, args.name)
     if not give_json(dataclasses.asdict(found), args.json):
         print(_told(found, settings))

@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any
 from rodif_core.errors import RodifError
 from rodif_core.shipped import shipped_checkpoint
 from rodif_core.spec import FinetuneMethod, TaskName
-from server.settings import Settings
 from worker.cli.loop import DemoConfig, DemoResult, play
-from worker.cli.options import add_config_argument
+from worker.cli.options import add_config_argument, names, output_file, read_settings
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from server.settings import Settings
     from worker.cli.client import Client
     from worker.supervisor import System
 
@@ -80,12 +80,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """The command's arguments."""
     parser = subparsers.add_parser("demo", help="the whole loop on a task, then the site")
     parser.add_argument(
-        "task", nargs="?", choices=list(TaskName), default=TaskName.AVOID, help="default: avoid"
+        "task", nargs="?", choices=names(TaskName), default=TaskName.AVOID, help="default: avoid"
     )
     parser.add_argument(
         "--headless", action="store_true", help="stop at the end; exit 1 on failure"
     )
-    parser.add_argument("--json", type=Path, help="write the table to this file")
+    parser.add_argument("--json", type=output_file, help="write the table to this file")
     parser.add_argument(
         "--state", type=Path, help="empty folder for all data (default: .rodif/demo-TIME)"
     )
@@ -194,7 +194,7 @@ def _settings(args: argparse.Namespace) -> Settings:
         given["host"] = args.host
     if args.port is not None or args.headless:
         given["port"] = args.port or 0
-    return Settings(**given, artifact_dir=None)
+    return read_settings(**given, artifact_dir=None)
 
 
 def _like_ctrl_c(_signal: int, _frame: FrameType | None) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rodif_core.errors import LearningError, RodifError
 from rodif_core.spec import TaskName, parse_name
+from worker.cli.options import names, output_file
 
 if TYPE_CHECKING:
     from rodif_core.trajectory import Trajectory
@@ -27,11 +28,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         usage="rodif demos TASK --out FILE [options]\n"
         "       rodif demos import TASK PATH [PATH …] --out FILE",
     )
-    parser.add_argument("what", choices=[*TaskName, IMPORT], metavar="TASK|import")
+    parser.add_argument("what", choices=[*names(TaskName), IMPORT], metavar="TASK|import")
     parser.add_argument(
         "paths", nargs="*", metavar="PATH", help="for import: the task, then files or folders"
     )
-    parser.add_argument("--out", type=Path, required=True, help="file to write (npz)")
+    parser.add_argument("--out", type=output_file, required=True, help="file to write (npz)")
     # No defaults here: an import refuses these, and must know whether they were given.
     parser.add_argument("--n", type=int, help=f"demonstrations (default {EPISODES})")
     parser.add_argument("--seed", type=int, help="(default 0)")

@@ -18,6 +18,7 @@ from typing import Literal
 
 from rodif_core.errors import RodifError
 from server.settings import Settings
+from worker.cli.options import read_settings
 
 OLDEST_PYTHON, FIRST_UNTESTED_PYTHON = (3, 11), (3, 14)
 PACKAGES: tuple[str, ...] = (
@@ -232,7 +233,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Print the report; 1 when a check failed."""
-    settings = Settings() if args.state is None else Settings(state_dir=args.state)
+    settings = read_settings(**({} if args.state is None else {"state_dir": args.state}))
     findings = examine(settings)
     if args.json:
         print(json.dumps([asdict(finding) for finding in findings], indent=2))

@@ -33,6 +33,17 @@ def read_checkpoint(name: str) -> bytes:
         ) from error
 
 
+def load_named(name: str) -> Checkpoint:
+    """The policy of `read_checkpoint`; raises CheckpointFileError that begins with its name."""
+    from rodif_core.policies.checkpoint import load_checkpoint
+
+    data = read_checkpoint(name)
+    try:
+        return load_checkpoint(data)
+    except CheckpointFileError as error:
+        raise CheckpointFileError(f"{name}: {error}") from error
+
+
 def rolled_out(
     checkpoint: Checkpoint, config: RolloutConfig, processes: int = 1
 ) -> list[Trajectory]:
@@ -71,10 +82,9 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from rodif_core.evaluate import summarise
-    from rodif_core.policies.checkpoint import load_checkpoint
     from worker.cli.tables import evaluation_table
 
-    checkpoint = load_checkpoint(read_checkpoint(args.checkpoint))
+    checkpoint = load_named(args.checkpoint)
     result = summarise(checkpoint, rolled_out(checkpoint, config, args.processes)).to_json()
     facts = {"task": checkpoint.task.value, "checkpoint": checkpoint.digest, "seed": args.seed}
     if give_json(result | facts, args.json):

@@ -57,10 +57,13 @@ class DemoConfig:
 
     def __post_init__(self) -> None:
         # All of these are looked at before anything starts, not when the loop comes to them.
-        sizes = ("episodes", "pairs", "labels", "annotators", "evaluation_episodes")
-        for name in (*sizes, "comparison_updates"):
+        for name in ("pairs", "labels", "annotators", "comparison_updates"):
             if getattr(self, name) < 1:
                 raise ValueOutOfRangeError(name, getattr(self, name), "at least 1")
+        # The API takes no fewer; a seed below 0 no generator.
+        for name, least in (("episodes", 2), ("evaluation_episodes", 10), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ValueOutOfRangeError(name, getattr(self, name), f"at least {least}")
         if not 0 <= self.flip_rate < 0.5:
             raise ValueOutOfRangeError("flip_rate", self.flip_rate, "in [0, 0.5)")
         method = self.finetune.get("method", FinetuneMethod.RODIF_GUIDED.value)

@@ -73,6 +73,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not _reader_left():
             raise
         return 1
+    except OSError as error:
+        if error.filename is None:
+            raise  # no file of the user's is in the way, so that a traceback tells more
+        print(f"rodif {args.command}: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
 
 
 def _reader_left() -> bool:

@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Mapping
 
-from server.settings import Settings
+from worker.cli.options import read_settings
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -23,7 +23,7 @@ def run(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -
     from worker.prepare import prepare
 
     password = environment.get("RODIF_ADMIN_PASSWORD") or None
-    prepared = prepare(Settings(), admin_password=password)
+    prepared = prepare(read_settings(), admin_password=password)
     print("The database is up to date.")
     print(how_to_sign_in(prepared, given=password is not None))
     return 0

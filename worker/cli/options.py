@@ -5,11 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
 from rodif_core.errors import RodifError
 from rodif_core.spec import FinetuneConfig
+from server.settings import Settings
 
 if TYPE_CHECKING:
     from worker.cli.client import Client
@@ -33,7 +37,7 @@ def add_connection_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def connect(args: argparse.Namespace) -> Client:
-    """A client of what `add_connection_arguments` says; raises RodifError without a token."""
+    """A client of what `add_connection_arguments` says; raises RodifError without a legal token."""
     from worker.cli.client import Client
 
     if not args.token:
@@ -41,7 +45,50 @@ def connect(args: argparse.Namespace) -> Client:
             f"a token is needed: sign in at {args.url} as an admin, make one under Tokens, and"
             " give it with --token or in RODIF_TOKEN"
         )
+    if not args.token.isascii() or not args.token.isprintable():
+        raise RodifError("the token has characters that no token has; copy it again: rdf_…")
     return Client(args.url, args.token)
+
+
+def names(kind: type[StrEnum]) -> list[str]:
+    """Legal values of an option, as text: of members argparse would show the representation."""
+    return [member.value for member in kind]
+
+
+def output_file(text: str) -> Path:
+    """Value of an option that names a file to write, looked at before the work and not after it.
+
+    Raises ArgumentTypeError for a folder, and where no file can be made.
+    """
+    path = Path(text)
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is a folder, but must be a file to write")
+    there = path if path.exists() else path.absolute().parent
+    while not there.exists():
+        there = there.parent
+    if not (path.exists() or there.is_dir()) or not os.access(there, os.W_OK):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} cannot be written: {str(there)!r} is no folder, or not yours to write"
+        )
+    return path
+
+
+def read_settings(**given: Any) -> Settings:
+    """The system's settings, of which `given` win over the environment.
+
+    Raises RodifError naming the setting, its value and what is legal.
+    """
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        wrong = [(str(one["loc"][0]), one) for one in error.errors()]
+        raise RodifError(
+            "; ".join(
+                f"{name if name in given else f'RODIF_{name.upper()}'} is {one['input']!r}:"
+                f" {one['msg']}"
+                for name, one in wrong
+            )
+        ) from None
 
 
 def finetune_settings(text: str) -> dict[str, Any]:
@@ -75,7 +122,12 @@ PRINTED = Path("-")  # --json without a file
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """`--json` prints JSON in place of the table, `--json FILE` writes it beside the table."""
     parser.add_argument(
-        "--json", type=Path, nargs="?", const=PRINTED, metavar="FILE", help="print or write JSON"
+        "--json",
+        type=output_file,
+        nargs="?",
+        const=PRINTED,
+        metavar="FILE",
+        help="print or write JSON",
     )
 
 

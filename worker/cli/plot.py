@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig
-from worker.cli.evaluate import read_checkpoint, rolled_out
+from worker.cli.evaluate import load_named, rolled_out
+from worker.cli.options import output_file
 
 if TYPE_CHECKING:
     from rodif_core.trajectory import Trajectory
@@ -23,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a .safetensors file, a task: its shipped checkpoint, or a .npz file of `rodif demos`"
         " or `rodif rollout --out`",
     )
-    parser.add_argument("--out", type=Path, required=True, help="file to write (png)")
+    parser.add_argument("--out", type=output_file, required=True, help="file to write (png)")
     parser.add_argument("--n", type=int, default=100, help="paths (default %(default)s)")
     parser.add_argument(
         "--seed", type=int, default=0, help="rollout i uses SEED + i (default %(default)s)"
@@ -32,6 +34,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Roll out or read, draw, write."""
+    if args.out.suffix.lower() != ".png":
+        raise ValueOutOfRangeError("out", str(args.out), "a file name that ends in .png")
     config = RolloutConfig(episodes=args.n, seed=args.seed)
 
     from labeling_ui.mode_plot import mode_plot
@@ -54,6 +58,4 @@ def _episodes(source: str, config: RolloutConfig) -> Sequence[Trajectory]:
 
         return load_demonstrations(Path(source))[: config.episodes]
 
-    from rodif_core.policies.checkpoint import load_checkpoint
-
-    return rolled_out(load_checkpoint(read_checkpoint(source)), config)
+    return rolled_out(load_named(source), config)

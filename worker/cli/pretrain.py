@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
+from worker.cli.options import names, output_file
 from worker.cli.takeovers import round_folder, take_over
 
 if TYPE_CHECKING:
@@ -34,8 +35,8 @@ DEMONSTRATIONS = 2000  # scripted ones, unless said
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
     parser = subparsers.add_parser("pretrain", help="train a policy on demonstrations")
-    parser.add_argument("task", choices=list(TaskName))
-    parser.add_argument("--out", type=Path, required=True, help="checkpoint file to write")
+    parser.add_argument("task", choices=names(TaskName))
+    parser.add_argument("--out", type=output_file, required=True, help="checkpoint file to write")
     parser.add_argument("--preset", choices=PRESET_NAMES, default="cpu")
     _add_demonstration_arguments(parser)
     parser.add_argument("--updates", type=int, help="from fresh weights (default: the preset's)")
@@ -212,12 +213,12 @@ def _begin(args: argparse.Namespace, config: PretrainConfig) -> Checkpoint | Non
     from rodif_core.fit import check_fit
     from rodif_core.policies.checkpoint import load_checkpoint
     from rodif_core.shipped import shipped_checkpoint
-    from worker.cli.evaluate import read_checkpoint
+    from worker.cli.evaluate import load_named
 
     if args.begin_with is None:
         named = config.begin_with
         return None if named is None else load_checkpoint(shipped_checkpoint(named))
-    start = load_checkpoint(read_checkpoint(str(args.begin_with)))
+    start = load_named(str(args.begin_with))
     check_fit(start)
     legal = [TaskName(args.task), *([config.begin_with] if config.begin_with else [])]
     if start.task not in legal:
@@ -238,6 +239,7 @@ def _train(args: argparse.Namespace, config: PretrainConfig, bar: Progress) -> C
     from rodif_core.training_state import Precision, check_device
 
     check_device(args.device)
+    config.policy_config(get_task(args.task))  # a shape that cannot be is told before the work
     checkpoint = start = _begin(args, config)
     shown, told = _first_shown(args, get_task(args.task), bar)
     shown_first = len(shown)

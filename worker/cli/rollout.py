@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import CheckpointFileError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
-from worker.cli.evaluate import read_checkpoint, rolled_out
-from worker.cli.options import add_json_argument, give_json
+from worker.cli.evaluate import load_named, rolled_out
+from worker.cli.options import add_json_argument, give_json, names, output_file
 
 MAP_DATA = ("paths", "path_groups")  # of an evaluation, for the site's maps; the film shows more
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The command's arguments."""
     parser = subparsers.add_parser("rollout", help="roll a policy out, and film it")
-    parser.add_argument("task", choices=list(TaskName))
+    parser.add_argument("task", choices=names(TaskName))
     parser.add_argument("--checkpoint", help="a .safetensors file (default: the shipped one)")
     parser.add_argument("--n", type=int, default=100, help="rollouts (default %(default)s)")
     parser.add_argument(
@@ -31,7 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--processes", type=int, default=1, help="cores used (default %(default)s)")
     parser.add_argument(
         "--video",
-        type=Path,
+        type=output_file,
         help="film of the first rollouts (mp4; or webp, for pages)",
     )
     parser.add_argument(
@@ -41,7 +41,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--detailed", action="store_true", help="film the detailed arm, which takes much longer"
     )
     parser.add_argument(
-        "--out", type=Path, help="file of the episodes (npz), which `rodif plot modes` draws"
+        "--out",
+        type=output_file,
+        help="file of the episodes (npz), which `rodif plot modes` draws",
     )
     add_json_argument(parser)
 
@@ -86,9 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _checkpoint(task: TaskName, file: str | None) -> Checkpoint:
     """The named file, or the task's shipped checkpoint; raises CheckpointFileError."""
-    from rodif_core.policies.checkpoint import load_checkpoint
-
-    checkpoint = load_checkpoint(read_checkpoint(task.value if file is None else file))
+    checkpoint = load_named(task.value if file is None else file)
     if checkpoint.task is not task:
         raise CheckpointFileError(
             f"{file} is a checkpoint of task {checkpoint.task.value!r}, not of {task.value!r}"

@@ -8,9 +8,10 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from rodif_core.errors import ValueOutOfRangeError
 from rodif_core.spec import FinetuneMethod
 from server.states import PublishRule
-from worker.cli.options import add_config_argument, add_connection_arguments, connect
+from worker.cli.options import add_config_argument, add_connection_arguments, connect, names
 
 if TYPE_CHECKING:
     from worker.cli.client import Client
@@ -59,10 +60,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("round", help="start a fine-tuning round and follow it")
     add_connection_arguments(parser)
     parser.add_argument(
-        "--method", choices=list(FinetuneMethod), help="default: what the campaign says"
+        "--method", choices=names(FinetuneMethod), help="default: what the campaign says"
     )
     parser.add_argument(
-        "--publish", choices=list(PublishRule), help="default: what the campaign says"
+        "--publish", choices=names(PublishRule), help="default: what the campaign says"
     )
     parser.add_argument(
         "--episodes", type=int, help="rollouts of the evaluation; default: what the campaign says"
@@ -95,6 +96,8 @@ def run(args: argparse.Namespace) -> int:
 
     from worker.cli.tables import evaluation_table
 
+    if not args.minutes >= 0:  # before the round is started, which nobody would then follow
+        raise ValueOutOfRangeError("minutes", args.minutes, "at least 0")
     # What is not given must not be sent: zero is a seed of rollouts that were labelled.
     given = {"episodes": args.episodes, "seed": args.seed}
     evaluation = {name: value for name, value in given.items() if value is not None}

@@ -60,6 +60,8 @@ class SimulationConfig:
         for field in ("annotators", "labels"):
             if getattr(self, field) < 1:
                 raise ValueOutOfRangeError(field, getattr(self, field), "at least 1")
+        if self.seed < 0:
+            raise ValueOutOfRangeError("seed", self.seed, "at least 0")
         if not 0 <= self.flip_rate <= 1:
             raise ValueOutOfRangeError("flip_rate", self.flip_rate, "in [0, 1]")
         if self.corruption not in CORRUPTIONS:

@@ -11,9 +11,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from server.settings import Settings
+from worker.cli.options import read_settings
 
 if TYPE_CHECKING:
+    from server.settings import Settings
     from worker.prepare import Prepared
 
 
@@ -31,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def settings_from(args: argparse.Namespace) -> Settings:
     """Command-line arguments win over the environment."""
     given: dict[str, Any] = {"state_dir": args.state, "host": args.host, "port": args.port}
-    return Settings(**{name: value for name, value in given.items() if value is not None})
+    return read_settings(**{name: value for name, value in given.items() if value is not None})
 
 
 def run(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rodif_core.errors import UnknownNameError
 from rodif_core.spec import TaskName
 from rodif_core.tasks.base import Array, Context
 from rodif_core.tasks.experts.aligning import AligningExpert
@@ -39,17 +41,31 @@ class Expert(Protocol):
         """The parameters, for the record of a demonstration."""
 
 
+Draw = Callable[[str, Context, np.random.Generator], Expert]
+
+
+def _same_everywhere(expert: Callable[[str], Expert]) -> Draw:
+    """Of an expert that differs by its mode only."""
+    return lambda mode, _context, _rng: expert(mode)
+
+
+EXPERTS: dict[TaskName, Draw] = {
+    TaskName.AVOID: AvoidExpert.draw,
+    TaskName.PUSHING: _same_everywhere(PushingExpert),
+    TaskName.SORTING: _same_everywhere(SortingExpert),
+    TaskName.ALIGNING: _same_everywhere(AligningExpert),
+    TaskName.STACKING: _same_everywhere(StackingExpert),
+    TaskName.ALIGNING_STATE: _same_everywhere(AligningExpert),
+    TaskName.STACKING_STATE: _same_everywhere(StackingExpert),
+}
+
+
 def draw_expert(task: TaskName, mode: str, context: Context, rng: np.random.Generator) -> Expert:
-    """An expert for one episode; raises UnknownNameError for a mode that the task has not."""
-    if task is TaskName.AVOID:
-        return AvoidExpert.draw(mode, context, rng)
-    if task is TaskName.PUSHING:
-        return PushingExpert(mode)
-    if task in (TaskName.ALIGNING, TaskName.ALIGNING_STATE):
-        return AligningExpert(mode)
-    if task in (TaskName.STACKING, TaskName.STACKING_STATE):
-        return StackingExpert(mode)
-    return SortingExpert(mode)
+    """An expert for one episode; raises UnknownNameError for a task without one, and for a mode
+    that the task has not."""
+    if task not in EXPERTS:
+        raise UnknownNameError("task with an expert", task.value, EXPERTS)
+    return EXPERTS[task](mode, context, rng)
 
 
-__all__ = ["Expert", "draw_expert"]
+__all__ = ["EXPERTS", "Expert", "draw_expert"]
