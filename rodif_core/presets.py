@@ -40,7 +40,7 @@ class PretrainConfig:
     rounds: int = 0  # of training on, also on what experts did after they took over
     recoveries: int = 300  # takeovers tried a round
     drives: int = 1  # rollouts for each of them; from 2 on, failures and every group get as many
-    steered_drives: int = 0  # further rollouts for each, by copies that each go one group's way
+    steered_drives: int = 0  # further rollouts for each, by copies that each go a rarer group's way
     round_updates: int = 8_000
     held_out: float = 0.1  # share of demonstrations kept for the held-out loss and the support
     images: ImageConfig | None = None  # for tasks with cameras
@@ -211,7 +211,12 @@ _TASK_CHANGES: dict[tuple[str, str], dict[str, Any]] = {
 
 
 def preset_for(task: TaskName, name: str) -> PretrainConfig:
-    """How a task's policy is pretrained; raises UnknownNameError listing the legal presets."""
+    """How a task's policy is pretrained.
+
+    Raises UnknownNameError for an unknown preset, and for a task that has none, listing the legal.
+    """
+    if task not in TASK_ARCHITECTURES:
+        raise UnknownNameError("task with presets", task, TASK_ARCHITECTURES)
     presets = PRESETS[TASK_ARCHITECTURES[task]]
     if name not in presets:
         raise UnknownNameError("preset", name, presets)

@@ -13,13 +13,14 @@ from server import accounts, sign_in
 from server.api.access import COOKIE, Admin, Anyone, ReadSession, UseServices, WriteSession
 from server.api.params import Cursor, Limit, PathId
 from server.api.services import Services
-from server.errors import NotAllowedError
+from server.errors import NotAllowedError, NotSignedInError
 from server.passwords import hash_password
 from server.schemas.accounts import (
     AnnotatorCreate,
     AnnotatorOut,
     AnnotatorPatch,
     MeOut,
+    OwnPassword,
     SessionCreate,
     SessionOut,
     TokenCreate,
@@ -53,15 +54,19 @@ def open_session(
     lifetime = timedelta(hours=settings.session_hours)
     with services.database.write() as session:
         secret = sign_in.open_session(session, now, me, source=source, lifetime=lifetime)
+    _set_cookie(response, secret, services)
+    return SessionOut(annotator=MeOut.model_validate(me))
+
+
+def _set_cookie(response: Response, secret: str, services: Services) -> None:
     response.set_cookie(
         COOKIE,
         secret,
-        max_age=int(lifetime.total_seconds()),
+        max_age=int(timedelta(hours=services.settings.session_hours).total_seconds()),
         httponly=True,
         samesite="lax",
-        secure=settings.secure_cookies,
+        secure=services.settings.secure_cookies,
     )
-    return SessionOut(annotator=MeOut.model_validate(me))
 
 
 @router.delete("/session", status_code=status.HTTP_204_NO_CONTENT)
@@ -78,6 +83,31 @@ def close_session(request: Request, response: Response, services: UseServices) -
 def me(me: Anyone) -> MeOut:
     """The signed-in account."""
     return MeOut.model_validate(me)
+
+
+@router.put("/me/password", status_code=status.HTTP_204_NO_CONTENT)
+def change_own_password(
+    body: OwnPassword, me: Anyone, request: Request, response: Response, services: UseServices
+) -> None:
+    """Set the own password. Ends all sessions and tokens; this browser gets a new session."""
+    now, settings = services.clock(), services.settings
+    source = sign_in.source_of(request.client.host if request.client else None)
+    # As for signing in: who found an open browser must not guess passwords without end.
+    with services.database.write() as session:
+        sign_in.note_attempt(session, now, name=me.name, source=source)
+    try:
+        with services.database.read() as session:
+            sign_in.check_password(session, me.name, body.current, cheap=settings.argon2_cheap)
+    except NotSignedInError as error:
+        raise NotAllowedError("the current password is not the one of this account") from error
+    password_hash = _hashed(body.password, services)
+    lifetime = timedelta(hours=settings.session_hours)
+    with services.database.write() as session:
+        accounts.change_annotator(
+            session, now, me.id, active=None, password_hash=password_hash, role=None, by=me.id
+        )
+        secret = sign_in.open_session(session, now, me, source=source, lifetime=lifetime)
+    _set_cookie(response, secret, services)
 
 
 def _out(account: Annotator, labels: int) -> AnnotatorOut:

@@ -37,6 +37,13 @@ class SessionOut(Out):
     annotator: MeOut
 
 
+class OwnPassword(In):
+    """A new password for the own account, and the one it has."""
+
+    current: Annotated[Text, Field(max_length=256)]
+    password: Password
+
+
 class AnnotatorCreate(In):
     """A new account; without a password it can only use tokens."""
 

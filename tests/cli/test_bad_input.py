@@ -42,6 +42,18 @@ def test_a_folder_in_place_of_a_file_to_write_is_told_at_once(
     assert f"'{tmp_path}' is a folder, but must be a file" in capsys.readouterr().err
 
 
+def test_a_file_in_place_of_a_folder_to_write_into_is_told_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = tmp_path / "file"
+    file.write_text("")
+    for wrong in (file, file / "deeper"):
+        with pytest.raises(SystemExit) as stopped:
+            main(["pretrain", "avoid", "--out", str(tmp_path / "x"), "--workspace", str(wrong)])
+        assert stopped.value.code == 2
+        assert f"'{wrong}' cannot be a folder to write into" in capsys.readouterr().err
+
+
 def test_a_file_below_a_file_cannot_be_written(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(Exception, match="cannot be written.*/file' is no folder"):

@@ -131,6 +131,7 @@ def test_account_of_a_person_is_never_used(api: RunningApi):
     ("change", "message"),
     [
         ({"flip_rate": 1.2}, r"flip_rate is 1.2, but must be in \[0, 1\]"),
+        ({"name": " "}, r"name is . ., but must be text that is not blank"),
         ({"labels": 0}, "labels is 0, but must be at least 1"),
         ({"annotators": 0}, "annotators is 0"),
         ({"corruption": "adversary"}, "'adversary', but must be exact or independent"),

@@ -135,6 +135,12 @@ def test_every_task_has_an_architecture_and_avoid_keeps_its_training() -> None:
         preset_for(TaskName.AVOID, "gpu")
 
 
+def test_a_task_without_presets_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(TASK_ARCHITECTURES, "pushing")
+    with pytest.raises(UnknownNameError, match="unknown task with presets 'pushing'.*'avoid'"):
+        preset_for(TaskName.PUSHING, "cpu")
+
+
 def test_mixed_precision_computes_in_half_and_keeps_full_weights(
     demonstrations: list[Trajectory],
 ) -> None:

@@ -57,18 +57,21 @@ def test_each_copy_goes_the_way_of_its_group(monkeypatch: pytest.MonkeyPatch):
     assert checkpoint.digest == tiny_checkpoint().digest  # the policy itself stays
 
 
-def test_a_group_without_successes_has_no_copy(monkeypatch: pytest.MonkeyPatch):
+def test_neither_a_group_without_successes_nor_that_of_most_has_a_copy(
+    monkeypatch: pytest.MonkeyPatch,
+):
     monkeypatch.setattr(steered, "UPDATES", 2)
     checkpoint = tiny_checkpoint()
-    left = drives(checkpoint.policy, "left", success=False)
-    right = drives(checkpoint.policy, "right")
-    assert list(steered_copies(checkpoint, [*left, *right], seed=0)) == ["right"]
-    assert steered_copies(checkpoint, left, seed=0) == {}
+    left, right = (drives(checkpoint.policy, group) for group in ("left", "right"))
+    failed = drives(checkpoint.policy, "left", success=False)
+    assert list(steered_copies(checkpoint, [*left[:2], *right], seed=0)) == ["left"]
+    assert steered_copies(checkpoint, [*failed, *right], seed=0) == {}
+    assert steered_copies(checkpoint, failed, seed=0) == {}
 
 
 def test_copies_are_the_same_each_time(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(steered, "UPDATES", 3)
     checkpoint = tiny_checkpoint()
-    driven = drives(checkpoint.policy, "right")
+    driven = [*drives(checkpoint.policy, "right"), *drives(checkpoint.policy, "left")]
     once, twice = (steered_copies(checkpoint, driven, seed=4)["right"] for _ in range(2))
     assert once.digest == twice.digest != checkpoint.digest

@@ -22,6 +22,7 @@ TRUTH = {"true_choice": "left", "corruption": "none", "criterion": "x"}
 # method, path, body, who may (ada: admin, sam: service, ann: annotator)
 ENDPOINTS: list[tuple[str, str, Any, set[str]]] = [
     ("GET", "/me", None, ALL),
+    ("PUT", "/me/password", {"current": "?", "password": "long enough"}, ALL),
     ("GET", "/annotators", None, ADMIN),
     ("POST", "/annotators", {"name": "x", "role": "annotator"}, ADMIN),
     ("PATCH", "/annotators/4", {"active": True}, ADMIN),

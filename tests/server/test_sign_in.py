@@ -64,6 +64,49 @@ def test_a_session_expires(sqlite_world: World) -> None:
     assert "expired at 2026-11-23T00:00:00+00:00" in answer.json()["detail"]
 
 
+OWN_PASSWORD = "/api/v1/me/password"
+CHANGE = {"current": PASSWORD, "password": "a better one"}
+
+
+def test_changing_the_own_password_ends_every_other_way_in(world: World) -> None:
+    here, elsewhere, script = (world.signed_in("ann"), world.signed_in("ann"), world.client("ann"))
+    assert here.put(OWN_PASSWORD, json=CHANGE).status_code == 204
+    assert here.get("/api/v1/me").json()["name"] == "ann"  # with the cookie of the answer
+    assert elsewhere.get("/api/v1/me").status_code == 401
+    assert script.get("/me").status_code == 401
+    stranger = world.browser()
+    assert stranger.post(SIGN_IN, json=RIGHT).status_code == 401
+    changed = RIGHT | {"password": CHANGE["password"]}
+    assert stranger.post(SIGN_IN, json=changed).status_code == 200
+    with world.database.read() as session:
+        entry = session.scalars(select(AuditEntry).order_by(AuditEntry.id.desc())).first()
+    assert entry is not None
+    assert (entry.actor_id, entry.action) == (world.ids["ann"], "annotator.change")
+    assert "better" not in str(entry.details)
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [({"current": "wrong horse"}, 403), ({"password": "short"}, 422)],
+    ids=["wrong current password", "too short a new one"],
+)
+def test_a_refused_change_of_the_own_password_changes_nothing(
+    sqlite_world: World, body: dict[str, str], status: int
+) -> None:
+    browser = sqlite_world.signed_in("ann")
+    assert browser.put(OWN_PASSWORD, json=CHANGE | body).status_code == status
+    assert browser.get("/api/v1/me").status_code == 200
+    assert sqlite_world.browser().post(SIGN_IN, json=RIGHT).status_code == 200
+
+
+def test_the_current_password_cannot_be_guessed_without_end(sqlite_world: World) -> None:
+    browser = sqlite_world.signed_in("ann")
+    wrong = CHANGE | {"current": "wrong horse"}
+    for _ in range(MAX_FAILURES_PER_NAME_AND_ADDRESS):
+        assert browser.put(OWN_PASSWORD, json=wrong).status_code == 403
+    assert browser.put(OWN_PASSWORD, json=CHANGE).status_code == 429
+
+
 @pytest.mark.parametrize(
     "body",
     [WRONG, {"name": "nobody", "password": PASSWORD}],

@@ -10,7 +10,7 @@ from playwright.sync_api import Page
 from server.states import Choice
 from server.store.tables import Campaign
 from tests.ui.driving import LabelPage, boxes, resize, until
-from tests.ui.studio import Studio
+from tests.ui.studio import PASSWORD, Studio
 
 pytestmark = pytest.mark.browser
 Opened = Callable[[int], LabelPage]
@@ -50,6 +50,28 @@ def test_escape_closes_the_account_menu_and_gives_the_focus_back(
     page.get_by_role("button", name="Sign out").wait_for(state="hidden")
     assert page.evaluate("document.activeElement.matches('.menu > summary')")
     assert page.locator("dialog[open]").count() == 0
+
+
+def test_an_annotator_changes_the_own_password_and_goes_on_labelling(
+    studio: Studio, page: Page, label_page: Opened
+) -> None:
+    driver = label_page(studio.add_campaign([True]))
+    page.get_by_label("Account of").click()
+    page.get_by_role("button", name="Change password").click()
+    dialog = page.get_by_role("dialog", name="Change password")
+    dialog.get_by_label("Current password").fill(PASSWORD)
+    dialog.get_by_label("New password", exact=True).type("zebra 1 2 3")  # keys of answers
+    dialog.get_by_label("New password again").fill("zebra 1 2 4")
+    page.keyboard.press("ArrowLeft")
+    dialog.get_by_role("button", name="Change password").click()
+    dialog.get_by_text("The two new passwords are not the same.").wait_for()
+    dialog.get_by_label("New password again").fill("zebra 1 2 3")
+    dialog.get_by_role("button", name="Change password").click()
+    page.get_by_text("Your password is changed.").wait_for()
+    assert studio.labels(driver.campaign_id) == []
+    page.evaluate("document.activeElement.blur()")
+    driver.press("ArrowDown")
+    assert studio.wait_for_labels(driver.campaign_id, 1)[0].choice == Choice.CANNOT_TELL
 
 
 def test_arrows_on_help_and_on_the_notes_undo_do_not_judge(

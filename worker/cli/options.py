@@ -73,6 +73,23 @@ def output_file(text: str) -> Path:
     return path
 
 
+def output_folder(text: str) -> Path:
+    """Value of an option that names a folder to write into, made if it is not there.
+
+    Raises ArgumentTypeError where that cannot be.
+    """
+    path = Path(text)
+    there = path.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} cannot be a folder to write into: {str(there)!r} is no folder, or not yours"
+            " to write"
+        )
+    return path
+
+
 def read_settings(**given: Any) -> Settings:
     """The system's settings, of which `given` win over the environment.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rodif_core.errors import RodifError, ValueOutOfRangeError
 from rodif_core.spec import RolloutConfig, TaskName
-from worker.cli.options import names, output_file
+from worker.cli.options import names, output_file, output_folder
 from worker.cli.takeovers import round_folder, take_over
 
 if TYPE_CHECKING:
@@ -55,7 +55,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="of the forward passes; bfloat16 is mixed precision (default: that on a GPU)",
     )
     parser.add_argument(
-        "--workspace", type=Path, help="keeps partial state; a broken run goes on from there"
+        "--workspace",
+        type=output_folder,
+        help="keeps partial state; a broken run goes on from there",
     )
     parser.add_argument(
         "--track",
@@ -89,8 +91,8 @@ def _add_round_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--steered-drives",
         type=int,
-        help="further rollouts for each takeover, by copies of the policy that each go one group's"
-        " way (default: the preset's)",
+        help="further rollouts for each takeover, by copies of the policy that each go the way"
+        " of a group it rarely goes (default: the preset's)",
     )
     parser.add_argument("--round-updates", type=int, help="of a round (default: the preset's)")
     parser.add_argument(

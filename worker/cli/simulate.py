@@ -62,6 +62,8 @@ class SimulationConfig:
                 raise ValueOutOfRangeError(field, getattr(self, field), "at least 1")
         if self.seed < 0:
             raise ValueOutOfRangeError("seed", self.seed, "at least 0")
+        if not self.name.strip():
+            raise ValueOutOfRangeError("name", self.name, "text that is not blank")
         if not 0 <= self.flip_rate <= 1:
             raise ValueOutOfRangeError("flip_rate", self.flip_rate, "in [0, 1]")
         if self.corruption not in CORRUPTIONS:

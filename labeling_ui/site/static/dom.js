@@ -136,9 +136,10 @@ function fieldRow(field) {
   } else if (field.kind === "textarea") {
     input = element("textarea.input", { ...shared, rows: 3, required: field.required }, field.value ?? "");
   } else {
-    const { min, max, step, placeholder, required } = field;
+    const { min, max, step, placeholder, required, autocomplete } = field;
     const type = field.kind ?? "text";
-    input = element("input.input", { ...shared, type, min, max, step, placeholder, required, value: field.value ?? "" });
+    const rules = { type, min, max, step, placeholder, required, autocomplete };
+    input = element("input.input", { ...shared, ...rules, value: field.value ?? "" });
   }
   const hint = field.hint ? element("small.muted", { id: `${id}-hint` }, field.hint) : null;
   return element("div.field", {}, element("label", { for: id }, field.label), input, hint);
