@@ -196,13 +196,17 @@ def list_labels(
     _me: Admin,
     session: ReadSession,
     in_force: bool | None = None,
+    pair_id: Id | None = None,
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> Page[RawLabel]:
     """Label rows of the campaign with everything on record, oldest first; all, unless asked for
-    those that are in force (the last word of their annotator, not taken back), or are not."""
+    those that are in force (the last word of their annotator, not taken back), or are not, or for
+    those of a pair."""
     get_campaign(session, campaign_id)
     query = select(Label).where(Label.campaign_id == campaign_id)
+    if pair_id is not None:
+        query = query.where(Label.pair_id == pair_id)
     if in_force is not None:
         query = query.where(is_effective() if in_force else not_(is_effective()))
     rows, next_cursor = page(session, query, Label.id, limit=limit, cursor=cursor)

@@ -387,6 +387,11 @@ def test_rows_tell_whether_they_are_in_force_and_can_be_asked_for_by_it(world: W
     rest = admin.get(f"{path}?in_force=false").json()["items"]
     assert [row["id"] for row in rest] == [1, 3, 4]
     assert admin.get(f"{path}?in_force=perhaps").status_code == 422
+    pair_id = handed[0]["pair"]["id"]
+    of_pair = admin.get(f"{path}?pair_id={pair_id}").json()["items"]
+    assert [row["id"] for row in of_pair if row["annotator_id"] == world.ids["ann"]] == [1, 2]
+    assert {row["pair_id"] for row in of_pair} == {pair_id}
+    assert admin.get(f"{path}?pair_id=0").status_code == 422
 
 
 def test_truth_of_simulated_annotators_is_kept_apart(world: World) -> None:

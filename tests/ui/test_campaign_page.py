@@ -202,6 +202,29 @@ def test_pairs_and_annotators_are_shown(studio: Studio, page: Page) -> None:
     until(page, loaded)
 
 
+def test_an_admin_watches_a_pair_and_sees_who_answered_what(studio: Studio, page: Page) -> None:
+    campaign = studio.add_campaign([True, False])
+    name = studio.add_annotator()
+    label_all(studio, campaign, name, ScreenChoice.LEFT)
+    open_campaign(page, studio, campaign)
+    page.get_by_role("button", name="Watch pair").first.click()
+    dialog = page.get_by_role("dialog", name="Pair")
+    answer = dialog.locator("#watch-answers tr", has_text=name)
+    assert "A is better" in answer.inner_text() and "yes" in answer.inner_text()
+    runs = dialog.locator("#watch-runs tbody tr")
+    assert runs.count() == 2 and runs.nth(0).inner_text().startswith("A")
+    until(page, "document.querySelector('#clock').textContent.includes('/ 0.0') === false")
+    clock = dialog.locator("#clock").inner_text()
+    until(page, f"document.querySelector('#clock').textContent !== {clock!r}")  # it plays
+    page.keyboard.press("r")
+    dialog.get_by_role("button", name="Pause").click()
+    dialog.get_by_role("button", name="Top").click()
+    assert dialog.get_by_role("button", name="Top").get_attribute("aria-pressed") == "true"
+    dialog.get_by_role("button", name="Close").click()
+    dialog.wait_for(state="hidden")
+    assert page.locator("iframe").count() == 0
+
+
 def test_annotators_are_kept_out_of_the_admin_pages(studio: Studio, page: Page) -> None:
     name = studio.add_annotator(Role.ANNOTATOR)
     page.goto(f"{studio.url}/admin")

@@ -8,6 +8,7 @@ import { drawCurves } from "./curves.js";
 import { describe, element, enable, find, replace } from "./dom.js";
 import { cancelJob } from "./job-actions.js";
 import { isRunning, liveCollect, liveRound, liveWords, showProgress } from "./live.js";
+import { watchPair } from "./pair-watch.js";
 import * as panels from "./panels.js";
 import { watchSystem } from "./readiness.js";
 import { renew } from "./steady.js";
@@ -144,7 +145,13 @@ function drawPairs() {
   const nothing = element("div.empty", {}, element("strong", {}, "No pairs yet"), "Collect runs: pairs are chosen among them and made into replays.");
   const box = find("#pairs");
   box.classList.toggle("pair-grid", pairs.length > 0);
-  renew(box, pairs.length > 0 ? panels.pairCards(pairs) : nothing, more);
+  renew(box, pairs.length > 0 ? panels.pairCards(pairs, watch) : nothing, more);
+}
+
+// As it is known by now: a card may have been drawn before its replay was made.
+function watch(pairId) {
+  const names = Object.fromEntries(data.stats.annotators.map((one) => [one.id, one.name]));
+  return watchPair(data.pairs.find((pair) => pair.id === pairId), names);
 }
 
 async function showMore(name) {

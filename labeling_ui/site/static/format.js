@@ -29,6 +29,9 @@ export function ago(text, now = Date.now()) {
 export const day = (text) =>
   new Date(text).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
 
+export const moment = (text) =>
+  new Date(text).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
+
 export const CHOICES = { left: "A is better", right: "B is better", equal: "Equal", cannot_tell: "Can’t tell" };
 
 const SPELLINGS = {

@@ -12,11 +12,14 @@ const COMMANDS = {
 const REPEATED = ["back", "on"]; // while the key is held down
 export const PAGE_KEYS = Object.keys(COMMANDS);
 
+// What a key asks for, if anything.
+export const commandOf = ({ key }) => COMMANDS[key.length === 1 ? key.toLowerCase() : key];
+
 // Calls `run(command)` for keys typed on the page. Returns a function that takes what the replay
 // tells of keys typed in the scene.
 export function listenToKeys(run) {
   const press = ({ key, repeat }) => {
-    const command = COMMANDS[key.length === 1 ? key.toLowerCase() : key];
+    const command = commandOf({ key });
     if (command && (!repeat || REPEATED.includes(command))) run(command);
     return command !== undefined;
   };

@@ -273,15 +273,7 @@ const openHelp = () => find("#help").showModal();
 const ACTIONS = {
   ...Object.fromEntries(Object.keys(CHOICES).map((choice) => [choice, () => judge(choice)])),
   undo,
-  toggle: () => transport.toggle(),
-  restart: () => transport.restart(),
-  back: () => transport.step(-1),
-  on: () => transport.step(1),
-  slower: () => transport.changeSpeed(-1),
-  faster: () => transport.changeSpeed(1),
-  front: () => transport.setView("front"),
-  top: () => transport.setView("top"),
-  low: () => transport.setView("low"),
+  ...transport.commands,
   help: openHelp,
 };
 const pressedInScene = listenToKeys((command) => {

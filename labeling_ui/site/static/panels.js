@@ -168,12 +168,16 @@ export function jobTable(jobs, { onRetry, onCancel }) {
   return table([["Job"], ["State"], ["Stage"], ["Attempts", "number"], ["When"], [""]], rows, "Nothing is waiting, running or failed.");
 }
 
-export function pairCards(pairs) {
+// onWatch: (id of a pair) => …
+export function pairCards(pairs, onWatch) {
   return pairs.map((pair) => element(
     "figure.pair", { dataset: { key: pair.id, pair: pair.id } },
-    pair.thumbnail_url
-      ? element("img", { src: pair.thumbnail_url, loading: "lazy", alt: `Paths of pair ${pair.id}` })
-      : element("div.blank", {}, words(pair.state)),
+    element(
+      "button.pair-open", { type: "button", title: "Watch it, and see the answers", "aria-label": `Watch pair ${pair.id}`, onclick: () => onWatch(pair.id) },
+      pair.thumbnail_url
+        ? element("img", { src: pair.thumbnail_url, loading: "lazy", alt: `Paths of pair ${pair.id}` })
+        : element("div.blank", {}, words(pair.state)),
+    ),
     element("figcaption", {}, element("span", {}, `Pair ${pair.id}`), element("span", {}, words(pair.reason))),
   ));
 }

@@ -13,6 +13,17 @@ export class Transport {
     this.player = null;
     this.view = "front";
     this.onUse = () => {};
+    this.commands = { // by their names in keys.js
+      toggle: () => this.toggle(),
+      restart: () => this.restart(),
+      back: () => this.step(-1),
+      on: () => this.step(1),
+      slower: () => this.changeSpeed(-1),
+      faster: () => this.changeSpeed(1),
+      front: () => this.setView("front"),
+      top: () => this.setView("top"),
+      low: () => this.setView("low"),
+    };
     find("#play").addEventListener("click", () => this.toggle());
     find("#restart").addEventListener("click", () => this.restart());
     find("#back").addEventListener("click", () => this.step(-1));
