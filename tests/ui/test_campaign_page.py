@@ -118,7 +118,7 @@ def test_round_is_followed_live_published_and_rolled_back(studio: Studio, page: 
     live.locator("li.now", has_text="Fine-tuning").wait_for()
     worker.progress("score", 0.25, loss=1.5, mean_vote=0.5)
     worker.progress("score", 0.5, loss=math.exp(-1), mean_vote=0.6)
-    live.get_by_text("score · 50 %").wait_for()
+    live.get_by_text("scoring the labelled runs · 50 %").wait_for()
     page.locator("#loss-chart .scatterlayer .trace").first.wait_for()
     page.locator("#vote-chart .scatterlayer .trace").first.wait_for()
 
@@ -206,6 +206,7 @@ def test_an_admin_watches_a_pair_and_sees_who_answered_what(studio: Studio, page
     campaign = studio.add_campaign([True, False])
     name = studio.add_annotator()
     label_all(studio, campaign, name, ScreenChoice.LEFT)
+    page.emulate_media(reduced_motion="no-preference")
     open_campaign(page, studio, campaign)
     page.get_by_role("button", name="Watch pair").first.click()
     dialog = page.get_by_role("dialog", name="Pair")
@@ -335,8 +336,8 @@ def test_focus_and_elements_stay_where_they_are_while_the_page_refreshes(
         else:
             worker.job_id = studio_job(studio, this.id)
             worker.progress("score", 0.5)
-            live.get_by_text("score · 50 %").wait_for()
-            page.locator("#jobs").get_by_text("score").wait_for()
+            live.get_by_text("scoring the labelled runs · 50 %").wait_for()
+            page.locator("#jobs").get_by_text("scoring the labelled runs").wait_for()
         assert page.evaluate("document.activeElement === window.before")
     assert page.locator("#live").get_attribute("aria-live") is None
 

@@ -1,6 +1,7 @@
 // Learning curves of a round, drawn by plotly.js from the installed package.
 
 import { find } from "./dom.js";
+import { stageWords } from "./format.js";
 
 let library = null;
 
@@ -44,7 +45,7 @@ function traces(points, value, colours, { relative = false } = {}) {
     stages.get(point.stage).push(point[value]);
   }
   return [...stages].map(([stage, values], index) => ({
-    type: "scatter", mode: values.length > 1 ? "lines" : "markers", name: stage,
+    type: "scatter", mode: values.length > 1 ? "lines" : "markers", name: stageWords(stage),
     x: values.map((_, step) => step + 1),
     y: relative ? values.map((one) => one / Math.abs(values[0] || 1)) : values,
     text: values.map((one) => one.toPrecision(4)),

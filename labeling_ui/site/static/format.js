@@ -38,4 +38,12 @@ const SPELLINGS = {
   finetuning: "fine-tuning", finetune: "fine-tune", bradley_terry: "Bradley–Terry", dawid_skene: "Dawid–Skene",
 };
 export const words = (name) => SPELLINGS[name] ?? String(name ?? "").replaceAll("_", " ");
+
+// What a job is at, in words; of a fine-tuning as rodif_core/guided.py names it.
+const STAGES = {
+  score: "scoring the labelled runs", choose: "trying scales on fresh runs", "choose again": "trying self-training on fresh runs",
+};
+export const stageWords = (name) =>
+  STAGES[name] ?? words(name).replace(/^guide s=(.+)$/, "guidance of scale $1");
+
 export const short = (digest) => String(digest ?? "").slice(0, 10);

@@ -1,7 +1,7 @@
 // Cards of what is running now: rounds with their stages, and collections.
 
 import { element, find } from "./dom.js";
-import { percent, words } from "./format.js";
+import { percent, stageWords } from "./format.js";
 
 const STAGES = [["queued", "Queued"], ["finetuning", "Fine-tuning"], ["evaluating", "Evaluation"], ["gating", "Gate"]];
 const RUNNING = STAGES.map(([state]) => state);
@@ -14,7 +14,7 @@ function meter(job) {
   const now = { role: "progressbar", "aria-label": "Progress of this stage", "aria-valuenow": Math.round(100 * share), "aria-valuemin": 0, "aria-valuemax": 100 };
   return [
     element("div.meter", now, element("div", { style: `width:${100 * share}%` })),
-    element("p.small.muted.live-stage", {}, job?.stage ? `${words(job.stage)} · ${percent(share)}` : before),
+    element("p.small.muted.live-stage", {}, job?.stage ? `${stageWords(job.stage)} · ${percent(share)}` : before),
   ];
 }
 
@@ -61,5 +61,5 @@ export function showProgress({ job_id: jobId, progress, stage }) {
   if (!card || typeof progress !== "number") return;
   find(".meter > div", card).style.width = `${100 * progress}%`;
   find(".meter", card).setAttribute("aria-valuenow", Math.round(100 * progress));
-  find(".live-stage", card).textContent = `${words(stage)} · ${percent(progress)}`;
+  find(".live-stage", card).textContent = `${stageWords(stage)} · ${percent(progress)}`;
 }

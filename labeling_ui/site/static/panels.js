@@ -1,7 +1,7 @@
 // Tables and tiles of the campaign page. Each function takes data and returns elements.
 
 import { element } from "./dom.js";
-import { ago, count, duration, interval, percent, short, words } from "./format.js";
+import { ago, count, duration, interval, percent, short, stageWords, words } from "./format.js";
 import { canBeCancelled } from "./job-actions.js";
 
 const STATE_LOOK = {
@@ -160,7 +160,7 @@ export function jobTable(jobs, { onRetry, onCancel }) {
     "tr", { dataset: { key: job.id, job: job.id } },
     cell(`${words(job.kind)} ${job.id}`),
     cell([pill(job.state), job.error ? under(element("span.error-text", {}, job.error)) : null]),
-    cell([words(job.stage), job.state === "running" ? under(percent(job.progress)) : null]),
+    cell([stageWords(job.stage), job.state === "running" ? under(percent(job.progress)) : null]),
     cell(job.attempt, ".number"),
     cell(ago(job.finished_at ?? job.started_at ?? job.created_at), ".tight"),
     cell(jobButton(job, onRetry, onCancel), ".tight"),
