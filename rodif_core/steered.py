@@ -2,9 +2,9 @@
 
 A policy that is about to be steered must be able to go each way wherever it may be sent. Left to
 itself it goes a rare way where that is easy, so that its own mistakes hardly show where it is hard.
-A copy that imitates its successes in one group goes that way nearly always; experts that take over
-from the copies show the way back from mistakes which the policy makes only once it is steered. The
-group of most successes needs no copy: there the policy drives itself.
+A copy that imitates its successes in one group goes that way mostly; experts that take over from
+the copies show the way back from mistakes which the policy makes only once it is steered. The group
+of most successes needs no copy: there the policy drives itself.
 """
 
 from __future__ import annotations
@@ -23,19 +23,23 @@ from rodif_core.trajectory import Trajectory
 UPDATES, LEARNING_RATE = 600, 3e-4
 
 
-def steered_copies(
-    checkpoint: Checkpoint, driven: Sequence[Trajectory], seed: int
-) -> dict[str, Checkpoint]:
-    """For each group with successes among the rollouts `driven`, but at most half of them all, a
-    copy that imitates those, by the groups' names and in the task's order. Deterministic on a CPU.
+def rare_groups(checkpoint: Checkpoint, driven: Sequence[Trajectory]) -> list[str]:
+    """The groups with successes among the rollouts `driven`, but at most half of them all, in the
+    task's order."""
+    done = [one.outcome["group"] for one in driven if one.success]
+    groups = get_task(checkpoint.task).groups
+    return [group for group in groups if 0 < done.count(group) <= len(done) / 2]
+
+
+def steered_copy(
+    checkpoint: Checkpoint, group: str, driven: Sequence[Trajectory], seed: int
+) -> Checkpoint:
+    """A copy that imitates the successes in a group among the rollouts `driven`, whoever drove.
+
+    Deterministic on a CPU. Raises LearningError when there is none.
     """
+    own = [one for one in driven if one.success and one.outcome["group"] == group]
     policy, config = checkpoint.policy, GuideConfig(updates=UPDATES, learning_rate=LEARNING_RATE)
-    done = [one for one in driven if one.success]
-    copies = {}
-    for group in get_task(checkpoint.task).groups:
-        own = [one for one in done if one.outcome["group"] == group]
-        if 0 < len(own) <= len(done) / 2:
-            moved = guide(policy, *decisions_done(policy, own), IMITATION, config, seed)
-            card = {"kind": "steered", "parent": checkpoint.digest, "group": group}
-            copies[group] = replace(checkpoint, policy=moved, card=card)
-    return copies
+    moved = guide(policy, *decisions_done(policy, own), IMITATION, config, seed)
+    card = {"kind": "steered", "parent": checkpoint.digest, "group": group}
+    return replace(checkpoint, policy=moved, card=card)

@@ -10,9 +10,10 @@ import torch
 
 from rodif_core import steered
 from rodif_core.diffusion.chain import add_noise
+from rodif_core.errors import LearningError
 from rodif_core.guided import decisions_done
 from rodif_core.policies.policy import DiffusionPolicy
-from rodif_core.steered import steered_copies
+from rodif_core.steered import rare_groups, steered_copy
 from rodif_core.trajectory import Trajectory
 from tests.core.learning import chain_trajectory, tiny_checkpoint
 
@@ -48,30 +49,34 @@ def test_each_copy_goes_the_way_of_its_group(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(steered, "LEARNING_RATE", 1e-2)
     checkpoint = tiny_checkpoint()
     left, right = drives(checkpoint.policy, "left"), drives(checkpoint.policy, "right")
-    copies = steered_copies(checkpoint, [*right, *left], seed=1)
-    assert list(copies) == ["left", "right"]
-    goes_left, goes_right = (copy.policy for copy in copies.values())
+    copies = [steered_copy(checkpoint, group, [*right, *left], 1) for group in ("left", "right")]
+    goes_left, goes_right = (copy.policy for copy in copies)
     assert error(goes_left, left) < error(goes_right, left) < error(checkpoint.policy, left)
     assert error(goes_right, right) < error(goes_left, right) < error(checkpoint.policy, right)
-    assert copies["left"].card["parent"] == checkpoint.digest
+    assert copies[0].card["parent"] == checkpoint.digest
     assert checkpoint.digest == tiny_checkpoint().digest  # the policy itself stays
 
 
-def test_neither_a_group_without_successes_nor_that_of_most_has_a_copy(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(steered, "UPDATES", 2)
+def test_neither_a_group_without_successes_nor_that_of_most_is_rare():
     checkpoint = tiny_checkpoint()
     left, right = (drives(checkpoint.policy, group) for group in ("left", "right"))
     failed = drives(checkpoint.policy, "left", success=False)
-    assert list(steered_copies(checkpoint, [*left[:2], *right], seed=0)) == ["left"]
-    assert steered_copies(checkpoint, [*failed, *right], seed=0) == {}
-    assert steered_copies(checkpoint, failed, seed=0) == {}
+    assert rare_groups(checkpoint, [*right, *left]) == ["left", "right"]
+    assert rare_groups(checkpoint, [*left[:2], *right]) == ["left"]
+    assert rare_groups(checkpoint, [*failed, *right]) == []
+    assert rare_groups(checkpoint, failed) == []
 
 
 def test_copies_are_the_same_each_time(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(steered, "UPDATES", 3)
     checkpoint = tiny_checkpoint()
     driven = [*drives(checkpoint.policy, "right"), *drives(checkpoint.policy, "left")]
-    once, twice = (steered_copies(checkpoint, driven, seed=4)["right"] for _ in range(2))
+    once, twice = (steered_copy(checkpoint, "right", driven, 4) for _ in range(2))
     assert once.digest == twice.digest != checkpoint.digest
+
+
+def test_a_copy_of_no_success_cannot_be_made():
+    checkpoint = tiny_checkpoint()
+    failed = drives(checkpoint.policy, "left", success=False)
+    with pytest.raises(LearningError):
+        steered_copy(checkpoint, "left", failed, 0)

@@ -75,15 +75,26 @@ def take_over(
 def _drive_steered(
     checkpoint: Checkpoint, driven: Sequence[Trajectory], settings: RolloutConfig, processes: int
 ) -> list[Trajectory]:
-    """The rollouts of `settings`, shared out among copies of the policy that go one group's way."""
-    from rodif_core.steered import steered_copies
+    """The rollouts of `settings`, shared out among copies of the policy that go a rare group's way.
+
+    A copy of what the policy itself did has seen that way where it is easy only. So half of the
+    rollouts are for learning from them, too: a second copy, which goes that way more surely, drives
+    the other half.
+    """
+    from rodif_core.steered import rare_groups, steered_copy
     from worker.parallel import parallel_rollout
 
-    copies = list(steered_copies(checkpoint, driven, settings.seed).values())
-    made, seed, left = [], settings.seed, settings.episodes
-    for index, copy in enumerate(copies):
-        share = left // (len(copies) - index)
-        if share:
-            made += parallel_rollout(copy, RolloutConfig(share, seed), processes)
-        seed, left = seed + share, left - share
+    groups = rare_groups(checkpoint, driven)
+    made: list[Trajectory] = []
+    seed, left = settings.seed, settings.episodes
+    for index, group in enumerate(groups):
+        share = left // (len(groups) - index)
+        left -= share
+        mine: list[Trajectory] = []
+        for count in (share // 2, share - share // 2):
+            if count:
+                copy = steered_copy(checkpoint, group, [*driven, *mine], seed)
+                mine += parallel_rollout(copy, RolloutConfig(count, seed), processes)
+                seed += count
+        made += mine
     return made
