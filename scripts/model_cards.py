@@ -110,7 +110,7 @@ def _commands(checkpoint: Checkpoint, shown: int) -> str:
     last = f"--evaluate {measurement(checkpoint)['n']} --out {name}.safetensors"
     if "began_with" not in card:
         return f"{first} {last}"
-    names = ("rounds", "recoveries", "drives", "steered_drives")
+    names = ("rounds", "recoveries", "drives", "steered_drives", "round_updates")
     options = " ".join(f"--{one.replace('_', '-')} {card['preset'][one]}" for one in names)
     return (
         f"{first} --out before.safetensors\n"

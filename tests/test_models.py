@@ -85,5 +85,6 @@ def test_card_of_a_policy_that_went_on_from_a_file_tells_both_commands():
     assert "With that policy (digest `abababababababab`) began 1 more of 700 updates" in card
     assert "takeovers (20) from it and from 60 rollouts of copies" in card
     assert "--demonstrations 2000 --out before.safetensors\n" in card
-    options = "--rounds 1 --recoveries 30 --drives 1 --steered-drives 2 --evaluate 500"
-    assert f"--begin-with before.safetensors --demonstrations 2000 {options}" in card
+    options = "--rounds 1 --recoveries 30 --drives 1 --steered-drives 2 --round-updates 700"
+    last = "--evaluate 500 --out pushing.safetensors"
+    assert f"--begin-with before.safetensors --demonstrations 2000 {options} {last}" in card

@@ -77,9 +77,8 @@ def _drive_steered(
 ) -> list[Trajectory]:
     """The rollouts of `settings`, shared out among copies of the policy that go a rare group's way.
 
-    A copy of what the policy itself did has seen that way where it is easy only. So half of the
-    rollouts are for learning from them, too: a second copy, which goes that way more surely, drives
-    the other half.
+    A copy of what the policy itself did has seen that way where it is easy only. So a second copy
+    learns from the successes of the first one, too, which drives half of the rollouts.
     """
     from rodif_core.steered import rare_groups, steered_copy
     from worker.parallel import parallel_rollout

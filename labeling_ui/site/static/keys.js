@@ -35,10 +35,14 @@ export function listenToKeys(run) {
 
 const isCovered = () => find("dialog[open], .menu[open]") !== null;
 
-// Whether the key belongs to the control that has the focus, to a sheet or to the browser.
-function isTaken({ target, key, ctrlKey, metaKey, altKey }) {
-  if (ctrlKey || metaKey || altKey || isCovered()) return true;
-  if (target.closest(".bar, .banner, .criterion, .toast, select, textarea, input:not([type=range])")) return true;
+function isTaken(event) {
+  return isCovered() || event.target.closest(".bar, .banner, .criterion, .toast") !== null || isOwn(event);
+}
+
+// Whether the key belongs to the control that has the focus, or to the browser.
+export function isOwn({ target, key, ctrlKey, metaKey, altKey }) {
+  if (ctrlKey || metaKey || altKey) return true;
+  if (target.closest("select, textarea, input:not([type=range])")) return true;
   if (key === " ") return target.closest("a, button, summary") !== null;
   return target.matches("input") && key.startsWith("Arrow");
 }

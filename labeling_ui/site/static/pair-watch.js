@@ -3,7 +3,7 @@
 import { get, getAll } from "./api.js";
 import { describe, element, find, replace } from "./dom.js";
 import { CHOICES, duration, moment, words } from "./format.js";
-import { commandOf } from "./keys.js";
+import { commandOf, isOwn } from "./keys.js";
 import { table } from "./panels.js";
 import { Player, canDraw3d } from "./player.js";
 import { Transport } from "./transport.js";
@@ -22,7 +22,7 @@ dialog.addEventListener("close", () => {
 });
 dialog.addEventListener("keydown", (event) => {
   const command = transport.commands[commandOf(event)];
-  if (!command) return;
+  if (!command || isOwn(event)) return;
   event.preventDefault();
   command();
 });
